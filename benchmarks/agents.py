@@ -236,8 +236,7 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
     options = parser.parse_args(arguments)
     require(
         *at_least_one(rounds=options.rounds, max_frames=options.max_frames),
-        *at_least_one(**{f"rows[{i}]": n for i, n in enumerate(options.rows)}),
-        *at_least_one(**{f"together[{i}]": n for i, n in enumerate(options.together)}),
+        *at_least_one(rows=min(options.rows), together=min(options.together, default=1)),
         (options.seeds >= 0, f"seeds must be >= 0, got {options.seeds}"),
         *positive(seconds=options.seconds, limit=options.limit),
     )

@@ -306,7 +306,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = _options(arguments)
 
     require(
-        *at_least_one(rounds=options.rounds, **{f"rows[{i}]": n for i, n in enumerate(options.rows)}),
+        *at_least_one(rounds=options.rounds, rows=min(options.rows)),
         *positive(seconds=options.seconds, limit=options.limit),
     )
     if options.threads:

@@ -269,7 +269,7 @@ def as_path(name: str, value: object) -> Path:
     """
     require((isinstance(value, (str, os.PathLike)), f"{name} must be a path, got {value!r:.80}"))
     path = Path(value)  # type: ignore[arg-type]
-    longest = max((len(os.fsencode(part)) for part in path.parts), default=0)
+    longest = max(map(len, map(os.fsencode, path.parts)), default=0)
     fits = longest <= LONGEST_NAME and len(os.fsencode(path)) <= LONGEST_PATH
     shown = f"got {len(str(path)):,} characters, {str(path)!r:.80}"
     require(

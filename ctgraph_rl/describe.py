@@ -107,8 +107,10 @@ def describe(curriculum: Curriculum, frames_per_second: float | None = None) -> 
         ValueError: for a rate that is not above 0.
     """
     require(*(positive(frames_per_second=frames_per_second) if frames_per_second is not None else ()))
-    sheets = (_blocks, _difficulty, _ceilings, _observations) if are_graphs(curriculum.tasks) else (_other_blocks,)
-    return [_overview(curriculum, frames_per_second), *(sheet(curriculum) for sheet in sheets)]
+    overview = _overview(curriculum, frames_per_second)
+    if not are_graphs(curriculum.tasks):
+        return [overview, _other_blocks(curriculum)]
+    return [overview, _blocks(curriculum), _difficulty(curriculum), _ceilings(curriculum), _observations(curriculum)]
 
 
 def _overview(curriculum: Curriculum, frames_per_second: float | None) -> Sheet:
@@ -200,9 +202,13 @@ def _blocks(curriculum: Curriculum) -> Sheet:
     columns = {"block": "r", "task": "l", "b": "r", "d": "r", "p": "r", "goal": "l", "frames": "r"}
     switches = any(block.switch is not None for block in curriculum.blocks)
     labels = dict(zip(curriculum.tasks, curriculum.labels, strict=True))
-    rows = [row for number, block in enumerate(curriculum.blocks, 1) for row in _block_rows(number, block, labels)]
-    shown = rows if switches else [row[:-1] for row in rows]
-    return Sheet("Blocks", columns | ({"switch": "l"} if switches else {}), tuple(shown))
+    if switches:
+        columns["switch"] = "l"
+    rows = []
+    for number, block in enumerate(curriculum.blocks, 1):
+        for row in _block_rows(number, block, labels):
+            rows.append(row[: len(columns)])
+    return Sheet("Blocks", columns, tuple(rows))
 
 
 def _other_blocks(curriculum: Curriculum) -> Sheet:
@@ -218,34 +224,37 @@ def _other_blocks(curriculum: Curriculum) -> Sheet:
 
 def _block_rows(number: int, block: Block, labels: Mapping[TaskLike, str]) -> Iterator[tuple[str, ...]]:
     """A row for each different task; what is of the whole block stands in the first."""
-    frames, switch = f"{block.num_frames:,}", "" if block.switch is None else repr(block.switch)
-    for i, task in enumerate(dict.fromkeys(ct_graphs(block.tasks, "this sheet"))):
-        graph, of_block = task.graph, (str(number), frames, switch) if i == 0 else ("", "", "")
+    name = str(number)
+    frames = f"{block.num_frames:,}"
+    switch = "" if block.switch is None else repr(block.switch)
+    for task in dict.fromkeys(ct_graphs(block.tasks, "this sheet")):
+        graph = task.graph
         shape = (str(graph.branching_factor), str(graph.depth), f"{graph.wait_prob:g}")
-        yield of_block[0], labels[task], *shape, ".".join(map(str, task.goal)), *of_block[1:]
+        yield name, labels[task], *shape, ".".join(map(str, task.goal)), frames, switch
+        name = frames = switch = ""
 
 
 def _difficulty(curriculum: Curriculum) -> Sheet:
     """Closed forms of each task's graph: how large it is, how long its episodes, how sparse its reward."""
-    rows = [(label, *_sizes(task.graph), *_closed_forms(task)) for task, label in _labelled(curriculum)]
+    rows = [(label, *_closed_forms(task)) for task, label in _labelled(curriculum)]
     sides = dict.fromkeys((*SIZES, *CLOSED_FORMS), "r")
     return Sheet("Tasks", {"task": "l", **sides}, tuple(rows), CLOSED_FORM_NOTES)
 
 
-def _sizes(graph: CTGraph) -> tuple[str, str]:
-    return _number(graph.num_states), _number(graph.num_end_states)
-
-
 def _closed_forms(task: Task) -> tuple[str, ...]:
     graph = task.graph
+    sizes = (graph.num_states, graph.num_end_states)
     probs = (graph.reward_prob_random, graph.end_prob_random, graph.reward_prob_navigation)
     lengths = (graph.expected_episode_length, graph.expected_search_episodes, random_frames_to_goal(task))
-    return tuple(map(_number, (*probs, *lengths)))
+    return tuple(map(_number, (*sizes, *probs, *lengths)))
 
 
 def _ceilings(curriculum: Curriculum) -> Sheet:
     """The best mean returns of policies that see less than all, or why they are not known."""
-    rows, reasons, easy, lost = [], [], [], []
+    rows = []
+    reasons = []
+    easy = []
+    lost = []
     limited: dict[str, bool] = {CHANGING_GOALS: False, NOISE_AS_DICE: False}
     for task, label in _labelled(curriculum):
         limited[CHANGING_GOALS] |= task.goal_change is not None
@@ -253,7 +262,8 @@ def _ceilings(curriculum: Curriculum) -> Sheet:
         found = [_ceiling(task, ceiling) for ceiling in CEILINGS.values()]
         rows.append((label, *(UNKNOWN if value is None else _number(value) for value, _ in found)))
         reasons += [f"{UNKNOWN}: {reason}" for _, reason in found if reason]
-        (memoryless, _), (optimal, _) = found[1], found[3]
+        memoryless = found[1][0]
+        optimal = found[3][0]
         alike = not task.observations.unique_decisions and task.goal_change is None
         if alike and None not in (memoryless, optimal) and memoryless == optimal:
             easy.append(label)
@@ -275,7 +285,8 @@ def _ceiling(task: Task, ceiling: Callable[[Task], float]) -> tuple[float | None
 
 def _observations(curriculum: Curriculum) -> Sheet:
     """Return what an observation leaves open about the state, and what varies where it is read."""
-    rows, reasons = [], []
+    rows = []
+    reasons = []
     for task, label in _labelled(curriculum):
         try:
             counts = "/".join(map(_number, states_per_observation(task).values()))

@@ -13,6 +13,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 
 from ctgraph_rl.board.system_calls import filter_of
@@ -119,7 +120,7 @@ def confined(
             made += ["--symlink", os.readlink(path), str(path)]
         elif path.exists():
             made += ["--ro-bind", str(path), str(path)]
-    for device in sorted(each for name in GRAPHICS for each in Path("/dev").glob(name)) if graphics else ():
+    for device in sorted(chain(*map(Path("/dev").glob, GRAPHICS))) if graphics else ():
         made += ["--dev-bind", str(device), str(device)]
     for place, name in OWN.items():
         made += ["--bind", str(folder / name), place]
@@ -136,5 +137,5 @@ def _needed(paths: Sequence[Path]) -> list[str]:
     package = Path(__file__).resolve().parents[2]
     sites = [path for path in sys.path if Path(path).name in ("site-packages", "dist-packages")]
     named: list[str | Path] = [*paths, sys.prefix, sys.base_prefix, *sites, *(package / name for name in PACKAGES)]
-    both = {path for each in named for path in (os.path.abspath(each), os.path.realpath(each))}
+    both = {*map(os.path.abspath, named), *map(os.path.realpath, named)}
     return sorted(path for path in both if os.path.isdir(path) and not Path(path).is_relative_to("/usr"))

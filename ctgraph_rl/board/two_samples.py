@@ -70,17 +70,19 @@ def compared(submitted: Sequence[float], found: Sequence[float]) -> Difference:
     Raises:
         ValueError: for a group without scores.
     """
-    sizes = len(submitted), len(found)
+    sizes = (len(submitted), len(found))
     require((min(sizes) > 0, f"a comparison needs scores of both groups, got {sizes[0]} and {sizes[1]}"))
     scores = np.array([[*submitted, *found]], dtype=np.float64)
-    p_value = float(_p_values(scores, sizes[1])[0])
-    squares = sum(float(np.var(group)) * len(group) for group in (submitted, found))
+    squares = float(np.var(submitted)) * sizes[0] + float(np.var(found)) * sizes[1]
     spread = math.sqrt(squares / max(1, sum(sizes) - 2))
     unit = detectable(*sizes)
-    drop = unit if math.isinf(unit) else unit * spread
-    means = float(np.mean(submitted)), float(np.mean(found))
     return Difference(
-        *means, p_value, low=_least_drop(scores, sizes[1]), high=-_least_drop(-scores, sizes[1]), detectable=drop
+        float(np.mean(submitted)),
+        float(np.mean(found)),
+        float(_p_values(scores, sizes[1])[0]),
+        low=_least_drop(scores, sizes[1]),
+        high=-_least_drop(-scores, sizes[1]),
+        detectable=unit if math.isinf(unit) else unit * spread,
     )
 
 
@@ -153,12 +155,14 @@ def _p_values(scores: np.ndarray, found: int) -> np.ndarray:
 @cache
 def _splits(count: int, found: int) -> np.ndarray:
     """Return who is in the second group, float64 [splits, count]: first the true one, then all or many random ones."""
-    last = [*range(count - found, count)]
     if math.comb(count, found) <= MOST_SPLITS:
-        chosen = [last, *(list(each) for each in combinations(range(count), found) if list(each) != last)]
+        chosen = np.array(list(combinations(range(count), found)))
+        chosen = np.roll(chosen, 1, axis=0)  # the true one is the last
     else:
         rng = np.random.default_rng(0)
-        chosen = [last, *(rng.permutation(count)[:found].tolist() for _ in range(MOST_SPLITS - 1))]
+        chosen = np.array(
+            [range(count - found, count), *(rng.permutation(count)[:found] for _ in range(MOST_SPLITS - 1))]
+        )
     member = np.zeros((len(chosen), count))
-    np.put_along_axis(member, np.array(chosen), 1.0, axis=1)
+    np.put_along_axis(member, chosen, 1.0, axis=1)
     return member

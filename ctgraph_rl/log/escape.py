@@ -28,13 +28,15 @@ _MARKDOWN = re.compile(
     re.IGNORECASE,
 )
 _NUMBERED = re.compile(r"^(\d{1,9})([.)])(?= |$)")
-_LATEX = {
-    **{character: f"\\{character}" for character in "&%$#_{}"},
-    **{"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"},
-    **{"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\textquotedbl{}"},
-    "±": r"$\pm$",
-    **{"[": "{[}", "*": "{*}"},  # which would belong to the end of the line before
-}
+_LATEX = str.maketrans(
+    {
+        **{character: f"\\{character}" for character in "&%$#_{}"},
+        **{"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"},
+        **{"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\textquotedbl{}"},
+        "±": r"$\pm$",
+        **{"[": "{[}", "*": "{*}"},  # which would belong to the end of the line before
+    }
+)
 
 
 def terminal_text(text: object) -> str:
@@ -53,7 +55,7 @@ def _printable(text: str) -> str:
 
 def listed(values: Iterable[object], most: int = 3) -> str:
     """Return the first of some values as text, and how many more there are."""
-    texts = [str(value) for value in values]
+    texts = list(map(str, values))
     more = f" and {len(texts) - most} more" if len(texts) > most else ""
     return ", ".join(texts[:most]) + more
 
@@ -75,7 +77,7 @@ def markdown_table(head: Sequence[str], rows: Iterable[Iterable[str]]) -> str:
 
 def latex_text(text: object) -> str:
     """Return one line that LaTeX shows unchanged, after the end of a table's row too."""
-    return "".join(_LATEX.get(character, character) for character in terminal_text(text))
+    return terminal_text(text).translate(_LATEX)
 
 
 def figure_text(text: object) -> str:
@@ -90,13 +92,13 @@ def csv_text(rows: Iterable[Iterable[Any]], end: str = "\n") -> str:
         rows: cells; None is an empty one.
         end: of a line.
     """
-    return "".join(_line(row) + end for row in rows)
+    return end.join([*map(_line, rows), ""])
 
 
 def _line(row: Iterable[Any]) -> str:
     """A line without its end; cells with an end of a line of any kind are quoted."""
     file = io.StringIO(newline="")
-    csv.writer(file, lineterminator="\r\n").writerow([_cell(value) for value in row])
+    csv.writer(file, lineterminator="\r\n").writerow(map(_cell, row))
     return file.getvalue().removesuffix("\r\n")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 from collections.abc import Iterable, Iterator
 from dataclasses import fields, is_dataclass, replace
+from itertools import filterfalse
 from typing import Any
 
 import tensordict
@@ -56,7 +57,8 @@ def provenance(curriculum: Curriculum, names: Iterable[str] | None = ()) -> Name
     return {
         "schema": SCHEMA,
         "curriculum": named(curriculum).name,
-        **{name: getattr(curriculum, name) for name in ("version", "source")},
+        "version": curriculum.version,
+        "source": curriculum.source,
         **code(curriculum, names),
         "tasks": list(curriculum.labels),
         "trained": [[number + 1 for number in block] for block in curriculum.trained],
@@ -83,12 +85,14 @@ def learners(config: ReadOnlyValues | None, agent: object) -> list[str]:
 
     The curriculum of a configuration is left out: what it is says its fingerprint, however it was made.
     """
-    named = list(targets({key: value for key, value in (config or {}).items() if key != "curriculum"}))
+    named = list(targets({**(config or {}), "curriculum": None}))
     if named or agent is None:
         return named
     parts = agent.modules() if isinstance(agent, torch.nn.Module) else [agent]
-    kinds = dict.fromkeys(full_name(kind) for part in parts for kind in type(part).__mro__)
-    return [name for name in kinds if not is_ours(name)]
+    found: dict[str, None] = {}
+    for part in parts:
+        found |= dict.fromkeys(filterfalse(is_ours, map(full_name, type(part).__mro__)))
+    return list(found)
 
 
 def _parts(value: Any) -> Iterator[str]:

@@ -107,14 +107,17 @@ class RunLog:
         Raises:
             ValueError: if the file ends before it, or a line is no measurement.
         """
-        path, size = Path(path), int(position["bytes"])
+        path = Path(path)
+        size = int(position["bytes"])
         there = path.stat().st_size
         require((there >= size, f"{path} has {there} bytes and the checkpoint needs {size}: restore the file"))
         with open_own(path, "r+b") as file:
             file.truncate(size)
         log = cls.read(path)
         require((log.torn_lines == 0, f"{path}: the last line before the checkpoint is torn: restore the file"))
-        log._path, log._file, log._num_bytes = path, open_own(path, "ab"), MOST_BYTES
+        log._path = path
+        log._file = open_own(path, "ab")
+        log._num_bytes = MOST_BYTES
         log._place = path.absolute()
         log._start -= position["seconds"]
         return log
@@ -297,8 +300,7 @@ class RunLog:
 
     def training(self, name: str, block: int | None = None) -> Tensor:
         """A field of the training intervals, of one block or of all, float64 [intervals]; NaN where it is null."""
-        intervals = [m for m in self.of_kind("training") if block in (None, m["block"])]
-        return _row([m.get(name) for m in intervals])
+        return _row([m.get(name) for m in self.of_kind("training") if block in (None, m["block"])])
 
     def training_by_block(self, name: str) -> dict[int, Tensor]:
         """`training` of each block that has intervals, by its number."""
@@ -333,7 +335,7 @@ class RunLog:
             return None
         frames, _ = next(reversed(rows))
         last = [row for (when, _), row in rows.items() if when == frames]
-        lengths = {len(row) for row in last}
+        lengths = set(map(len, last))
         require((len(lengths) == 1, f"tasks must adapt in as many episodes, the log has {lengths}: restore the log"))
         fields = []
         for name in ("return_mean", "success_rate", "found_rate", "exact_rate"):
@@ -425,8 +427,11 @@ class RunLog:
 
     def _evaluations(self, during: bool) -> list[NamedValues]:
         """Evaluations of the curriculum's own tasks."""
-        own = [m for m in self.of_kind("evaluation") if not m.get("held_out")]
-        return own if during else [m for m in own if m.get("moment") != "during"]
+        found = []
+        for m in self.of_kind("evaluation"):
+            if not m.get("held_out") and (during or m.get("moment") != "during"):
+                found.append(m)
+        return found
 
     def _matrix(self, rows: Iterable[Mapping[int, float | None]], num_tasks: int) -> Tensor:
         """Rows of values by task number, NaN where a row has none."""

@@ -183,7 +183,8 @@ def _needed(statements: Iterable[ast.stmt], name: str) -> list[ast.stmt]:
     kept = set[ast.stmt]()
     while new := {each for each in mentions if each not in kept and defines[each] & wanted}:
         kept |= new
-        wanted |= set[str]().union(*(mentions[each] for each in new))
+        for each in new:
+            wanted |= mentions[each]
     return [each for each in mentions if each in kept]
 
 
@@ -219,15 +220,16 @@ def _imports(tree: ast.AST, package: str) -> Iterator[str]:
     """Yield the dotted names that statements import, and those of modules that ``import_module`` imports."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            for alias in node.names:
+                yield alias.name
         elif isinstance(node, ast.ImportFrom):
             parents = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
-            start = [*filter(None, parents), *filter(None, [node.module])]
-            yield from (".".join([*start, alias.name]) for alias in node.names if parents or not node.level)
+            for alias in node.names if parents or not node.level else ():
+                yield ".".join(filter(None, [*parents, node.module, alias.name]))
         elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "__import__")):
-            given = [*node.args[:1], *(each.value for each in node.keywords if each.arg == "name")]
-            names = [each.value for each in given if isinstance(each, ast.Constant) and isinstance(each.value, str)]
-            yield from (f"{package}{name}" if name.startswith(".") else name for name in names)
+            for each in (*node.args[:1], *(each.value for each in node.keywords if each.arg == "name")):
+                if isinstance(each, ast.Constant) and isinstance(each.value, str):
+                    yield f"{package}{each.value}" if each.value.startswith(".") else each.value
 
 
 def syntax(tree: ast.AST) -> Iterator[str]:
@@ -242,7 +244,9 @@ def syntax(tree: ast.AST) -> Iterator[str]:
             fields = {name: value for name, value in ast.iter_fields(part) if name not in NOT_CODE}
             if isinstance(part, ast.JoinedStr):
                 fields["values"] = list(_joined(part.values))
-            named = [each for name in sorted(fields) for each in _field(name, fields[name])]
+            named: list[Any] = []
+            for name in sorted(fields):
+                named += _field(name, fields[name])
             waiting += [_Text(")"), *reversed(named), _Text(f"{type(part).__name__}(")]
         elif isinstance(part, list):
             waiting += [_Text("]"), *reversed(part), _Text("[")]

@@ -64,8 +64,8 @@ def _least_mean(values: tuple[float, ...], tail: float) -> float:
         tail: the probability below.
     """
     n = len(values)
-    ones = sum(value == 1 for value in values)
-    if ones + sum(value == 0 for value in values) == n:
+    ones = values.count(1)
+    if ones + values.count(0) == n:
         return float(scipy("special").betaincinv(ones, n - ones + 1, tail)) if ones else 0.0
     if values[0] == values[-1]:
         return values[0] * tail ** (1 / n)

@@ -35,8 +35,10 @@ def objective_of(name: str, run_dirs: Sequence[Path]) -> float:
     Raises:
         ValueError: if a run has no value; says why.
     """
-    found = {run_dir: metrics_of((run_dir / METRICS).read_bytes())[name] for run_dir in run_dirs}
-    for run_dir, metric in found.items():
+    values = []
+    for run_dir in run_dirs:
+        metric = metrics_of((run_dir / METRICS).read_bytes())[name]
         why = f"objective={name} has no value in {run_dir}: {metric['undefined']}"
         require((metric["value"] is not None, why))
-    return sum(metric["value"] for metric in found.values()) / len(found)
+        values.append(metric["value"])
+    return sum(values) / len(values)

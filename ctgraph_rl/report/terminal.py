@@ -246,12 +246,20 @@ def code_notes(runs: Sequence[Run]) -> list[str]:
 
     Groups are those of runs, and those of the single-task experts that they are compared with.
     """
-    older = [run for run in runs if run.code["numbers version"] < numbers_of(run.about)]
-    unknown = [run for run in runs if None in run.code.values()]
-    versions = ", ".join(sorted({str(run.code["numbers version"]) for run in older}))
-    needed = ", ".join(sorted({str(numbers_of(run.about)) for run in older}))
-    said = f"of numbers version {versions}, this package is of {needed}: it may give other numbers"
-    found = [(len(older), said), (len(unknown), "of unknown code: they do not say of which source they are")]
+    older = 0
+    unknown = 0
+    stored = set()
+    needed = set()
+    for run in runs:
+        code = run.code
+        unknown += None in code.values()
+        if code["numbers version"] < numbers_of(run.about):
+            older += 1
+            stored.add(str(code["numbers version"]))
+            needed.add(str(numbers_of(run.about)))
+    versions = f"of numbers version {', '.join(sorted(stored))}, this package is of {', '.join(sorted(needed))}"
+    found = [(older, f"{versions}: it may give other numbers")]
+    found.append((unknown, "of unknown code: they do not say of which source they are"))
     for size, count in sorted(Counter(map(group_size, runs)).items()):
         if size > 1 and count < len(runs):
             found.append((count, f"of seeds trained together, {size} at a time; they differ from others by rounding"))
