@@ -27,7 +27,7 @@ RUN = "ctgraph_rl.run"
 COMMANDS = {
     "run": Command(RUN, "train an agent on a curriculum (default command)"),
     "agents": Command("baselines.__main__", "list the agents"),
-    "board": Command("ctgraph_rl.board.standings.page", "make a page with tables of submissions"),
+    "board": Command("ctgraph_rl.board.standings.board_page", "make a page with tables of submissions"),
     "collectives": Command(
         "ctgraph_rl.collective.__main__", "make a page of figures and tables of learners that share"
     ),

@@ -91,20 +91,14 @@ CLASSES_OF_ONE_NAME = {"Trained": "a loaded run, which ctgraph_rl exports, and b
 
 MODULES_OF_ONE_NAME = {
     "adaptation": "a setting of evaluations: its metrics, its figure, and named sequences that need it",
-    "bounds": "of returns: as metrics take them, and as reports find them",
-    "ceilings": "of performance: of a track, and the metrics",
     "environments": "speed of the environments, and the tests that theirs inherit; both are said after a folder",
-    "formats": "of the board's tables and of a report's",
     "gym": "the environment that users import, and sequences of Gymnasium's tasks",
     "job": "of a run, and of a collective",
     "labels": "that learners give: in a log, as metrics, and as a figure",
     "masks": "of weights, and the sequences of the papers on them",
     "memory": "bytes of images, and sequences that need a memory",
-    "method": "what methods derive from, and the facts of a submitted one",
-    "page": "of the board and of a report",
     "seeds": "as one batch: the learners, and the runs",
     "style": "of figures: of reports in print, and of pictures of tasks",
-    "tables": "of the board, and of a log",
 }
 """Names of several modules, each said after its folder, and why."""
 

@@ -11,8 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import zip_longest
 from typing import NamedTuple
 
-from ctgraph_rl.board.method import fact_rules, facts_of, track_version
-from ctgraph_rl.board.rules import curriculum_rule, entry_rule, one_line, oracle_rule, seed_rules
+from ctgraph_rl.board.method_yaml import fact_rules, facts_of, track_version
 from ctgraph_rl.board.submission import (
     CONFIG,
     EVALUATIONS,
@@ -27,6 +26,7 @@ from ctgraph_rl.board.submission import (
     experts_of,
     log_sum,
 )
+from ctgraph_rl.board.submission_rules import curriculum_rule, entry_rule, one_line, oracle_rule, seed_rules
 from ctgraph_rl.checks import ReadOnlyValues, Rule, is_real
 from ctgraph_rl.disk import read_regular
 from ctgraph_rl.learn.evaluate import Evaluator

@@ -1,6 +1,6 @@
 """A submission: a folder of files with which you can check what a method reached.
 
-- ``method.yaml``: about the method, see `ctgraph_rl.board.method`.
+- ``method.yaml``: about the method, see `ctgraph_rl.board.method_yaml`.
 - ``config.yaml``: the configuration that all runs share, without the seed; ``versions.txt``: the versions that computed
   them, and the kind of machine that computed the metrics; ``curriculum.json``: what they learned.
 - ``runs.csv``: a line for each seed, with the columns `COLUMNS`.
@@ -23,7 +23,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from ctgraph_rl.board.method import read_method
+from ctgraph_rl.board.method_yaml import read_method
 from ctgraph_rl.board.tracks import Track, track
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_int, is_shallow, repeated, require
 from ctgraph_rl.disk import read_regular

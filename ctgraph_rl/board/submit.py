@@ -13,18 +13,8 @@ import yaml
 
 from ctgraph_rl import parsers
 from ctgraph_rl.board import submission as files
-from ctgraph_rl.board.method import TEMPLATE, completed, fact_rules, facts_of, read_method
+from ctgraph_rl.board.method_yaml import TEMPLATE, completed, fact_rules, facts_of, read_method
 from ctgraph_rl.board.rescore import metrics_text, near, rescore
-from ctgraph_rl.board.rules import (
-    code_rules,
-    curriculum_rule,
-    entry_rule,
-    failure_rules,
-    one_line,
-    oracle_rule,
-    same_rules,
-    seed_rules,
-)
 from ctgraph_rl.board.submission import (
     FAILED,
     FINISHED,
@@ -37,6 +27,16 @@ from ctgraph_rl.board.submission import (
     read_submission,
     runs_text,
     versions_text,
+)
+from ctgraph_rl.board.submission_rules import (
+    code_rules,
+    curriculum_rule,
+    entry_rule,
+    failure_rules,
+    one_line,
+    oracle_rule,
+    same_rules,
+    seed_rules,
 )
 from ctgraph_rl.board.tracks import Track, track
 from ctgraph_rl.checks import ReadOnlyValues, Rule, repeated, require
@@ -68,7 +68,7 @@ def submit(
     Args:
         paths: run directories, or folders that hold them.
         to: the folder to make; must not exist.
-        method: what ``method.yaml`` holds; see `ctgraph_rl.board.method.read_method`.
+        method: what ``method.yaml`` holds; see `ctgraph_rl.board.method_yaml.read_method`.
         of_track: the track that it is for; None: it is for none.
         only: values of settings by dotted names, such as ``{"curriculum.depth": 4}``; runs with others are left out.
 

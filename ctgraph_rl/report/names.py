@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from ctgraph_rl.checks import did_you_mean, repeated, require
-from ctgraph_rl.report.bounds import curriculum_of, published
+from ctgraph_rl.report.bounds_of_runs import curriculum_of, published
 from ctgraph_rl.runs.read import MODIFIED, Run, grouped, present
 from ctgraph_rl.tasks.curriculum import Curriculum
 

@@ -21,7 +21,7 @@ from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.tables import check_table, write_evaluations
 from ctgraph_rl.report import statistics
-from ctgraph_rl.report.bounds import BoundsOfRuns, bounds_by_curriculum
+from ctgraph_rl.report.bounds_of_runs import BoundsOfRuns, bounds_by_curriculum
 from ctgraph_rl.report.formats import FORMATS, LEGENDS, NO_RUN_FINISHED, SENTENCES
 from ctgraph_rl.report.names import displayed, modifications
 from ctgraph_rl.report.statistics import Comparison, Estimate, mean

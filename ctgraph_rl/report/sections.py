@@ -10,14 +10,14 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import accumulate, zip_longest
+from itertools import accumulate, chain, zip_longest
 from statistics import fmean
 from typing import NamedTuple
 
 import numpy as np
 
 from ctgraph_rl.learn.progress import Count, silent
-from ctgraph_rl.report.bounds import NO_BOUNDS, BoundsOfRuns, bounds_by_curriculum
+from ctgraph_rl.report.bounds_of_runs import NO_BOUNDS, BoundsOfRuns, bounds_by_curriculum
 from ctgraph_rl.report.formats import measure_name
 from ctgraph_rl.report.intervals import UNBOUNDED, Bounds
 from ctgraph_rl.report.names import modifications
@@ -114,7 +114,7 @@ class Section:
     @property
     def runs(self) -> list[Run]:
         """All that there are, finished or not."""
-        return [run for result in self.results for run in result.runs]
+        return list(chain(*(result.runs for result in self.results)))
 
     @property
     def finished(self) -> list[Run]:

@@ -163,8 +163,18 @@ class Job:
 
     def _train(self, curriculum: Curriculum, agent: Agent, where: RunDirectory) -> None:
         """Train into a directory, with checkpoints."""
-        of_run = {name: getattr(where, name) for name in ("config", "checkpoints", "experts", "listeners", "console")}
-        train(curriculum, agent, where.run_dir, self.cfg.seed, self.device, **of_run)
+        train(
+            curriculum,
+            agent,
+            where.run_dir,
+            self.cfg.seed,
+            self.device,
+            config=where.config,
+            checkpoints=where.checkpoints,
+            experts=where.experts,
+            listeners=where.listeners,
+            console=where.console,
+        )
 
     def _checkpoints(self, run_dir: Path) -> Checkpoints:
         strict = self.cfg.resume == "strict"
@@ -399,9 +409,9 @@ def with_changes(curriculum: Curriculum, cfg: DictConfig) -> Curriculum:
     """
     made = type(curriculum).__name__
     require((isinstance(curriculum, Curriculum), f"{cfg.curriculum._target_} must make a Curriculum, it made a {made}"))
-    evaluation, protocol = (config.changes_of(cfg, part) for part in config.PARTS)
+    protocol = config.changes_of(cfg, "protocol")
     how = curriculum.protocol
     if protocol.get("task_id") == "hidden":
         how = replace(how, task_id="hidden", num_task_ids=None, task_ids=None)  # hidden ids have no length or numbers
-    measured = changed("evaluation", curriculum.evaluation, evaluation)
+    measured = changed("evaluation", curriculum.evaluation, config.changes_of(cfg, "evaluation"))
     return replace(curriculum, evaluation=measured, protocol=changed("protocol", how, protocol))

@@ -196,7 +196,8 @@ class Recorder:
 
     def _check_same(self, begun: Mapping[str, Any]) -> None:
         """Refuse to resume a run of another curriculum or of other settings; `resumed_log` knows of code."""
-        before, now = (each.get("fingerprint") for each in (begun, self._about))
+        before = begun.get("fingerprint")
+        now = self._about["fingerprint"]
         other = f"{self.run_dir} holds a run of {begun.get('curriculum')} (fingerprint {before}), this one has {now}"
         changed = differences(begun.get("config") or {}, self._about["config"])
         fix = "give what it was begun with, choose another run_dir, or overwrite=True"

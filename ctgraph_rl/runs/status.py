@@ -217,9 +217,12 @@ class SweepProgress:
 
     def look(self) -> tuple[int, int, int]:
         """Return the numbers of cells that are done, failed and running."""
-        found = {folder: status_of(folder, before).state for folder, before in self._left.items()}
-        self._left = {folder: before for folder, before in self._left.items() if found[folder] != DONE}
-        counts = Counter(found.values())
+        counts: Counter[str] = Counter()
+        for folder, before in list(self._left.items()):
+            state = status_of(folder, before).state
+            counts[state] += 1
+            if state == DONE:
+                del self._left[folder]
         return self.total - len(self._left), counts[FAILED], counts[IN_USE]
 
     def describe(self, done: int, failed: int, running: int, ended: int, seconds: float) -> str:

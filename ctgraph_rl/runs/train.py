@@ -169,7 +169,8 @@ def train(
         (can_listen, f"listeners must be a list of functions, such as [print], got {listeners!r:.80}"),
         (is_console, f"console must be a rich.console.Console, or None, got {console!r:.80}"),
     )
-    device, config = checked_device(device), {"seed": seed, **(config or {})}
+    device = checked_device(device)
+    config = {"seed": seed, **(config or {})}
     check_rows(curriculum, agent.num_envs)
     check_ids(curriculum, agent)
     checkpoints = Checkpoints(run_dir / CHECKPOINTS) if checkpoints is None else checkpoints
@@ -206,7 +207,8 @@ class RunDirectory:
 
     def begin(self, curriculum: Curriculum, agent: Agent, saved: RunState | None) -> RunLog:
         """Return the log of a new run, or of one that is resumed from a saved state."""
-        run_dir, about = self.run_dir, provenance(curriculum, learners(self.config, agent))
+        run_dir = self.run_dir
+        about = provenance(curriculum, learners(self.config, agent))
         if self.together:
             about |= {"together": list(self.together), "numbers": NUMBERS_TOGETHER}
         if saved is None:
@@ -305,10 +307,9 @@ def execute(
     Returns:
         What ``learn`` returned.
     """
-    logs = [
-        participant.directory.begin(participant.curriculum, participant.agent, state)
-        for participant, state in zip(participants, saved, strict=True)
-    ]
+    logs = []
+    for participant, state in zip(participants, saved, strict=True):
+        logs.append(participant.directory.begin(participant.curriculum, participant.agent, state))
     with progress:
         failed = learn(logs)
     for number, (participant, log) in enumerate(zip(participants, logs, strict=True)):
@@ -364,13 +365,16 @@ def resumed_log(run_dir: Path, saved: RunState, about: ReadOnlyValues, strict: b
     Raises:
         ValueError: if the log does not fit the checkpoint, and if ``strict`` for what may change the run's bits.
     """
-    path, same = run_dir / LOG, ("versions", "machine", "num_threads")
+    path = run_dir / LOG
     before = RunLog.begun(path) or {}
     lost = f"{run_dir} has checkpoints, but no {LOG} of a run: restore it, or start with overwrite=true"
     require((bool(before), lost))
     changed = ", ".join(code_changes(before, about))
     require((not changed, f"{run_dir} was begun with other code: {changed} changed; {START_AGAIN}"))
-    other = {key: [before.get(key), about[key]] for key in same if before.get(key) != about[key]}
+    other = {}
+    for key in ("versions", "machine", "num_threads"):
+        if before.get(key) != about[key]:
+            other[key] = [before.get(key), about[key]]
     message = f"{run_dir} was begun with other {other}; from here on its bits may differ from those of one machine"
     require((not (strict and other), f"{message}; resume=warn resumes it all the same"))
     if other:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from yaml_settings import ALONE, escaped
 
-from ctgraph_rl.board.standings.ceilings import Ceilings, ceilings_of
+from ctgraph_rl.board.standings.track_ceilings import Ceilings, ceilings_of
 from ctgraph_rl.board.tracks import Track, Variant, tracks
 
 COLUMNS = {

@@ -13,7 +13,7 @@ from helpers.sweeping import command_line
 
 from ctgraph_rl.board import relearn, rerun, verify
 from ctgraph_rl.board.isolate import Isolation, Outcome
-from ctgraph_rl.board.method import TEMPLATE
+from ctgraph_rl.board.method_yaml import TEMPLATE
 from ctgraph_rl.board.relearn import Relearning
 from ctgraph_rl.board.submission import Submission, read_submission
 from ctgraph_rl.board.submit import submit

@@ -17,8 +17,8 @@ import pytest
 from ctgraph_rl import cli
 from ctgraph_rl.board import verify
 from ctgraph_rl.board.rescore import Check, rescore
+from ctgraph_rl.board.standings.board_page import write_board
 from ctgraph_rl.board.standings.entries import FIELDS, entry_of, read_entries, verification_of
-from ctgraph_rl.board.standings.page import write_board
 from ctgraph_rl.board.submission import VERIFICATION, read_submission
 
 for package in ("jinja2", "scipy", "pyarrow"):

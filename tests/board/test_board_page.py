@@ -10,8 +10,8 @@ import pytest
 from helpers.paths import CHECKOUT
 
 from ctgraph_rl import cli
+from ctgraph_rl.board.standings.board_tables import BoardTable, tables
 from ctgraph_rl.board.standings.entries import read_entries
-from ctgraph_rl.board.standings.tables import BoardTable, tables
 from ctgraph_rl.board.submission import VERIFICATION, read_submission
 from ctgraph_rl.log.provenance import machine
 from ctgraph_rl.portable import cpu_model

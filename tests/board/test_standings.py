@@ -15,12 +15,12 @@ import yaml
 
 import curricula
 from ctgraph_rl import Protocol
-from ctgraph_rl.board.method import TEMPLATE
-from ctgraph_rl.board.standings import formats
-from ctgraph_rl.board.standings.ceilings import ceilings_of
+from ctgraph_rl.board.method_yaml import TEMPLATE
+from ctgraph_rl.board.standings import board_formats as formats
+from ctgraph_rl.board.standings.board_page import html
+from ctgraph_rl.board.standings.board_tables import BoardTable, tables
 from ctgraph_rl.board.standings.entries import BoardEntry, Verification
-from ctgraph_rl.board.standings.page import html
-from ctgraph_rl.board.standings.tables import BoardTable, tables
+from ctgraph_rl.board.standings.track_ceilings import ceilings_of
 from ctgraph_rl.board.tracks import Track, track
 from ctgraph_rl.report import statistics
 

@@ -8,7 +8,7 @@ import zlib
 import pytest
 from helpers.paths import CHECKOUT
 
-from ctgraph_rl.board.method import EXAMPLE
+from ctgraph_rl.board.method_yaml import EXAMPLE
 from ctgraph_rl.board.submission import COLUMNS, FILES, METRIC_COLUMNS, VERIFICATION, read_submission
 
 pytest.importorskip("pyarrow")

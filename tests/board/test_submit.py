@@ -17,9 +17,9 @@ from helpers.sweeping import command_line
 
 from ctgraph_rl import Recorder, RunLog
 from ctgraph_rl.board import submit as module
-from ctgraph_rl.board.method import fact_rules, read_method
-from ctgraph_rl.board.rules import oracle_rule
+from ctgraph_rl.board.method_yaml import fact_rules, read_method
 from ctgraph_rl.board.submission import log_sum, read_submission
+from ctgraph_rl.board.submission_rules import oracle_rule
 from ctgraph_rl.board.submit import submit
 from ctgraph_rl.log.saved import sum_of_state
 from ctgraph_rl.runs.config import plain

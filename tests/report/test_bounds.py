@@ -17,7 +17,7 @@ from ctgraph_rl.core.rewards import Arrival, Gradient, ReferenceLinear
 from ctgraph_rl.metrics.bounds import Known
 from ctgraph_rl.metrics.record import METRICS
 from ctgraph_rl.report import page
-from ctgraph_rl.report.bounds import bounds_of
+from ctgraph_rl.report.bounds_of_runs import bounds_of
 from ctgraph_rl.report.intervals import UNBOUNDED, Bounds
 from ctgraph_rl.report.results import comparisons, table
 from ctgraph_rl.report.sections import sections

@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ctgraph_rl.board import verify
-from ctgraph_rl.board.method import track_version
+from ctgraph_rl.board.method_yaml import track_version
 from ctgraph_rl.board.rescore import MEASURES, Check
 from ctgraph_rl.board.submission import METHOD, METRICS, RUNS, VERIFICATION, Submission, read_submission
 from ctgraph_rl.board.tracks import Track, Variant
 from ctgraph_rl.checks import repeated, require
 from ctgraph_rl.disk import read_regular
 from ctgraph_rl.log.escape import listed
-from ctgraph_rl.report.bounds import bounds_of_curriculum
+from ctgraph_rl.report.bounds_of_runs import bounds_of_curriculum
 from ctgraph_rl.report.intervals import Bounds, within_bounds
 from ctgraph_rl.runs.read import Problem
 from ctgraph_rl.strict import files_below, json_value, one_line_of, too_deep

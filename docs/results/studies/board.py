@@ -8,11 +8,11 @@ from pathlib import Path
 from string import Template
 from typing import Any, NamedTuple
 
-from ctgraph_rl.board.method import OURS
+from ctgraph_rl.board.method_yaml import OURS
+from ctgraph_rl.board.standings.board_formats import columns
+from ctgraph_rl.board.standings.board_page import write_board
+from ctgraph_rl.board.standings.board_tables import BoardTable
 from ctgraph_rl.board.standings.entries import shown_level
-from ctgraph_rl.board.standings.formats import columns
-from ctgraph_rl.board.standings.page import write_board
-from ctgraph_rl.board.standings.tables import BoardTable
 from studies.raw import HERE, TEMPLATES, table
 
 FOLDER = HERE / "board"
@@ -89,7 +89,7 @@ def _method(about: About, commit: str) -> dict[str, Any]:
     """Return what ``method.yaml`` says."""
     import yaml
 
-    from ctgraph_rl.board.method import TEMPLATE
+    from ctgraph_rl.board.method_yaml import TEMPLATE
 
     method = yaml.safe_load(TEMPLATE)
     method |= {"name": about.name, "track": TRACK, "authors": ["The ctgraph_rl developers"], "paper": about.paper}

@@ -17,11 +17,11 @@ from helpers.sweeping import command_line
 import curricula
 from ctgraph_rl import Block, Curriculum, Evaluation, Protocol, Recorder, evaluate, learn_curriculum, load, make_agent
 from ctgraph_rl.board.held_out import other_curriculum
-from ctgraph_rl.board.standings.ceilings import ceilings_of, in_words
+from ctgraph_rl.board.standings.track_ceilings import ceilings_of, in_words
 from ctgraph_rl.compare import main as compare
 from ctgraph_rl.policies import OptimalPolicy
 from ctgraph_rl.report.__main__ import main as report
-from ctgraph_rl.report.bounds import bounds_of_curriculum
+from ctgraph_rl.report.bounds_of_runs import bounds_of_curriculum
 from ctgraph_rl.tasks.kinds.gym_task import GymTask
 from ctgraph_rl.tasks.switch import Drift
 

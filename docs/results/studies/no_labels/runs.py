@@ -49,7 +49,7 @@ def measured(run: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     from ctgraph_rl.learn.labels import label_spans
     from ctgraph_rl.log.files import LOG
     from ctgraph_rl.log.run_log import RunLog
-    from ctgraph_rl.report.bounds import bounds_of_curriculum
+    from ctgraph_rl.report.bounds_of_runs import bounds_of_curriculum
     from ctgraph_rl.tasks.curriculum import Curriculum
 
     log, curriculum = RunLog.read(run / LOG), Curriculum.from_json(run / "curriculum.json")

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import yaml
 
 from ctgraph_rl import __version__
-from ctgraph_rl.board.method import OURS
-from ctgraph_rl.board.standings.ceilings import in_words
+from ctgraph_rl.board.method_yaml import OURS
+from ctgraph_rl.board.standings.board_tables import BoardTable, Standing, is_significant
 from ctgraph_rl.board.standings.entries import LEVELS, shown_level
-from ctgraph_rl.board.standings.tables import BoardTable, Standing, is_significant
+from ctgraph_rl.board.standings.track_ceilings import in_words
 from ctgraph_rl.checks import NamedValues
 from ctgraph_rl.log.escape import csv_text, markdown_table, markdown_text
 from ctgraph_rl.metrics import METRICS

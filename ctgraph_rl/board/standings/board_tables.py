@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 
-from ctgraph_rl.board.standings.ceilings import Ceilings, ceilings_of
 from ctgraph_rl.board.standings.entries import BoardEntry, names_of
+from ctgraph_rl.board.standings.track_ceilings import Ceilings, ceilings_of
 from ctgraph_rl.board.tracks import Track, Variant
 from ctgraph_rl.report import statistics
-from ctgraph_rl.report.bounds import bounds_of_curriculum
+from ctgraph_rl.report.bounds_of_runs import bounds_of_curriculum
 from ctgraph_rl.report.statistics import LEVEL, Comparison, Estimate
 from ctgraph_rl.runs.read import split_by
 

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ctgraph_rl import __version__, parsers
-from ctgraph_rl.board.standings import formats
+from ctgraph_rl.board.standings import board_formats as formats
+from ctgraph_rl.board.standings.board_tables import BoardTable, tables
 from ctgraph_rl.board.standings.croissant import croissant
 from ctgraph_rl.board.standings.entries import LEVELS, BoardEntry, read_entries, shown_level
-from ctgraph_rl.board.standings.tables import BoardTable, tables
 from ctgraph_rl.checks import require
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.log.escape import terminal_text
