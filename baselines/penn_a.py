@@ -16,9 +16,10 @@ g^3 or 0 below 0.01, and r = 100 g^3. A life begins with these weights.
 
 After a generation the population is cut into segments at a random place. The best of a segment has all its children:
 clones or crossed with a random individual, then with a neuron more or less, then with all genes mutated by +-exp(-180
-|u|), u uniform in [-1, 1]. Individuals before the first segment have a child each. The best one of all stays unchanged
-and is individual 0. The autoencoder learns from what the population saw. The paper leaves open what a new neuron is:
-here standard or modulatory with equal probability, its genes uniform.
+|u|), u uniform in [-1, 1]. A new neuron is standard or modulatory with equal probability, and its genes are 0 before
+that. Individuals before the first segment have a child each. The best one of all stays unchanged and is individual 0.
+The first generation's genes of weights are mutated zeros, with 10 in place of 180, those of the rule uniform. The
+autoencoder learns from what the population saw.
 
 A greedy evaluation plays the best individual, which is the result of evolution; the mean of the population has mutants
 that are of no use, and training measures it. An evaluation that samples plays the population in turns.
@@ -53,7 +54,7 @@ NEURONS = (False, False, False, False, True, True, True)
 """Which neurons of the first individuals are modulatory; the first neuron acts."""
 
 FIRST_PRECISION = 10.0
-"""Of the mutation of zeros that gives the first individuals their genes."""
+"""Of the mutation that gives the first individuals their genes."""
 
 WEIGHTS, OUTPUTS = f"{UNSTORED}weights", f"{UNSTORED}outputs"
 
@@ -145,7 +146,7 @@ class Reproduction(NamedTuple):
         """Give some children the rows of a mate's genes from a random one on, as far as both have neurons."""
         crosses = chances(parents).view(-1, 1) < self.crossover_prob
         shared = torch.minimum(parents.size, mates.size)
-        point = (chances(parents) * (parents.num_inputs + shared)).floor().view(-1, 1)
+        point = 1 + (chances(parents) * (parents.num_inputs + shared - 1)).floor().view(-1, 1)
         row = torch.arange(parents.genes.shape[1], device=point.device)
         from_mate = (crosses & (row >= point)).unsqueeze(-1) & parents.within(shared)
         swapped = crosses & (torch.rand_like(parents.rule) < 0.5)
@@ -155,17 +156,18 @@ class Reproduction(NamedTuple):
         )
 
     def resized(self, population: Population) -> Population:
-        """Insert, duplicate or delete a neuron of some individuals, but never the first neuron."""
+        """Insert, duplicate or delete a neuron of some individuals; the first neuron stays."""
         size = population.size
         new = population.modulates.shape[1]
-        other = (1 + torch.rand_like(population.rule[:, 0]) * (size - 1)).long().minimum(size - 1)
+        lost = (1 + torch.rand_like(population.rule[:, 0]) * (size - 1)).long().minimum(size - 1)
+        model = (torch.rand_like(population.rule[:, 0]) * size).long().minimum(size - 1)
         chance = chances(population)
         inserts = chance < self.insert_prob
         grows = chance < self.insert_prob + self.duplicate_prob
         shrinks = ~grows & (chance < self.insert_prob + self.duplicate_prob + self.delete_prob) & (size > 1)
         source = torch.arange(new + 1, device=size.device).repeat(len(size), 1)
-        place = torch.where(grows, size, other).unsqueeze(-1)
-        copied = torch.where(shrinks, size - 1, torch.where(inserts, new, other)).unsqueeze(-1)
+        place = torch.where(grows, size, lost).unsqueeze(-1)
+        copied = torch.where(shrinks, size - 1, torch.where(inserts, new, model)).unsqueeze(-1)
         source = torch.where((grows | shrinks).unsqueeze(-1), source.scatter(1, place, copied), source)
         size = size + grows.long() - shrinks.long()
         return rearranged(population, source[:, : int(size.max())], size)
@@ -188,8 +190,6 @@ def rearranged(population: Population, source: Tensor, size: Tensor) -> Populati
     """
     inputs = population.num_inputs
     genes = pad(population.genes, (0, 1, 0, 1))
-    genes[:, :, -1] = draw_like(genes[:, :, -1])
-    genes[:, -1] = draw_like(genes[:, -1])
     modulates = pad(population.modulates, (0, 1))
     modulates[:, -1] = torch.rand_like(genes[:, 0, 0]) < 0.5
     always = torch.arange(inputs, device=size.device).expand(len(size), -1)
@@ -233,7 +233,7 @@ def first_population(count: int, num_inputs: int) -> Population:
     modulates = torch.tensor(NEURONS, dtype=torch.bool, device="cpu").repeat(count, 1)
     size = modulates.new_full((count,), len(NEURONS), dtype=torch.int64)
     genes = torch.zeros(count, num_inputs + len(NEURONS), len(NEURONS), dtype=torch.float32, device="cpu")
-    return mutated(Population(genes, genes[:, :5, 0], modulates, size), FIRST_PRECISION)
+    return mutated(Population(genes, draw_like(genes[:, :5, 0]), modulates, size), FIRST_PRECISION)
 
 
 def layers(*widths: int) -> nn.Sequential:

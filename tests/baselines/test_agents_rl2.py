@@ -9,7 +9,8 @@ from tensordict import TensorDict
 from torchrl.envs.utils import set_exploration_type
 
 from baselines.rl2 import episodes_to_goal
-from ctgraph_rl import Block, CTGraphEnv, Curriculum, evaluate, learn_curriculum
+from ctgraph_rl import Block, CTGraphEnv, Curriculum, RunLog, evaluate, learn_curriculum
+from ctgraph_rl.learn.evaluate import Evaluator
 from ctgraph_rl.tasks.curriculum import Evaluation
 from curricula.paper import ct_su_b1
 
@@ -103,6 +104,24 @@ def test_the_return_goes_on_over_the_episodes_of_a_trial_and_ends_with_it(small_
     # The value after the third step is 4. Going on: 0.5 * 4 = 2, then 1 + 0.5 * 2, then 0.5 * 2.
     # Where the trial ended after the second step: 2, then 1, then 0.5.
     assert learnt["value_target"].squeeze(-1).tolist() == [[1.0, 2.0, 2.0], [0.5, 1.0, 2.0]]
+
+
+def test_an_evaluation_with_episodes_to_adapt_in_keeps_the_memory_of_a_trial(small_agent):
+    agent = small_rl2(small_agent)
+    how = Evaluation(4, greedy=False, adapt_episodes=1)
+    curriculum = Curriculum("one", 1, "here", [Block(ct_su_b1(), 16)], evaluation=how)
+    seen = []
+
+    def act(data):
+        seen.append(agent.policy(data).clone())
+        return seen[-1]
+
+    Evaluator(curriculum, 0, RunLog()).evaluate(act, 0, "before", agent.initial_state)
+
+    played = torch.stack(seen, dim=1)
+    values = agent.critic.module(over_sequences(agent, played))
+    assert (played["is_init"] & (played["next", "trial"] == 2)).any(dim=1).all()
+    torch.testing.assert_close(values, played["state_value"], atol=1e-6, rtol=0)
 
 
 def test_one_step_teaches_nothing_and_is_no_error(small_agent):

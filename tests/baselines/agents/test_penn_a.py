@@ -17,7 +17,18 @@ from torch import nn
 from torchrl.envs.utils import set_exploration_type
 
 from baselines import penn_a
-from baselines.penn_a import OUTPUTS, WEIGHTS, PennA, Population, Reproduction, live, mutation, rearranged, winners
+from baselines.penn_a import (
+    OUTPUTS,
+    WEIGHTS,
+    PennA,
+    Population,
+    Reproduction,
+    first_population,
+    live,
+    mutation,
+    rearranged,
+    winners,
+)
 from ctgraph_rl import Block, CTGraph, CTGraphEnv, Curriculum, evaluate
 from ctgraph_rl.learn.collect import collect
 from ctgraph_rl.runs.train import new_agent
@@ -141,6 +152,17 @@ def test_mutations_have_the_law_of_the_source():
     assert abs((changes > 0).double().mean() - 0.5) < 4 * 0.5 / math.sqrt(20_000)
 
 
+def test_most_individuals_of_the_first_generation_can_learn():
+    """By a uniform rule; P(|g| > x) = -ln(x) / 10 of genes of weights."""
+    torch.manual_seed(0)
+
+    first = first_population(2001, 3)
+
+    cube = 0.01 ** (1 / 3)
+    assert abs((first.rule.abs() > cube).double().mean() - 0.77) < 0.02
+    assert abs((first.genes[1:].abs() > cube).double().mean() + math.log(cube) / 10) < 0.01
+
+
 def test_the_best_of_a_segment_has_all_its_children():
     fitness = torch.tensor([9.0, 0, 1, 5, 2, 3, 8, 7, 6, 4, 0, 2])
 
@@ -177,8 +199,9 @@ def test_a_neuron_is_inserted_duplicated_or_deleted_and_the_others_keep_their_ge
         assert len({*diagonal} & {*others}) == min(size, size - sizes)
         assert len({*diagonal}) == size - (change == "duplicate")
         assert diagonal[0] == others[0]
-        assert new[: 3 + size, :size].count_nonzero() == (3 + size) * size
-        assert new.count_nonzero() == (3 + size) * size
+        known = size - (change == "insert")  # the genes of a new neuron are 0
+        assert new[: 3 + known, :known].count_nonzero() == (3 + known) * known
+        assert new.count_nonzero() == (3 + known) * known
 
 
 def test_rows_and_columns_of_a_copied_neuron_are_those_of_its_model():
