@@ -330,9 +330,7 @@ def test_the_ratio_is_our_median_speed_over_theirs_and_most_seeds_must_solve():
 
 @pytest.mark.slow
 def test_a_run_starts_within_1_3_times_the_bare_imports():
-    times = [(seconds(BARE), seconds(RUN)) for _ in range(2)]
-
-    assert min(run / bare for bare, run in times) < 1.3
+    assert any(seconds(RUN) / seconds(BARE) < 1.3 for _ in range(2)), "measured again where it was too long"
 
 
 def test_graphs_for_acting_of_equal_code_are_compiled_once(small_agent, monkeypatch):

@@ -83,7 +83,7 @@ def test_a_method_is_named_after_what_it_is_and_its_settings_have_comments(name)
     assert [line for line in own if not re.fullmatch(r"\w+: \S+ +# \S.*", line)] == []
 
 
-@pytest.mark.parametrize("entry", catalogue("method"), ids=lambda entry: entry.name)
+@pytest.mark.parametrize("entry", list(catalogue("method")), ids=lambda entry: entry.name)
 def test_a_method_refuses_what_the_list_says_that_it_needs(compose, entry):
     name, ids = entry.name, needs_ids(entry)
 
