@@ -17,8 +17,7 @@ def main() -> None:
     config_dir = config_dir_of("agents", main.__doc__)
     print("agent=NAME   memory  can solve in principle")
     for agent in catalogue("agent", config_dir):
-        memory = {True: "yes", False: "no"}.get(agent.facts.get("memory"), "-")
-        print(f"{agent.name:<12} {memory:<7} {agent.facts.get('solves', agent.comment)}")
+        print(f"{agent.name:<12} {agent.says('memory'):<7} {agent.facts.get('solves', agent.comment)}")
     print("\ncell=NAME      can hold")
     for cell in catalogue("cell", config_dir):
         print(f"{cell.name:<14} {cell.facts.get('holds', cell.comment)}")

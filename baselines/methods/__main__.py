@@ -7,9 +7,8 @@ from baselines.parts.catalogue import CatalogueEntry, catalogue, config_dir_of
 
 def needs_ids(method: CatalogueEntry) -> str:
     """Return when a method needs task ids: ``yes``, ``no``, with which setting, or ``-`` of one of yours."""
-    if not method.facts:
-        return "-"
-    return "yes" if method.facts["needs_task_id"] else "heads=multi" if "heads" in method.settings else "no"
+    needs = method.says("needs_task_id")
+    return "heads=multi" if needs == "no" and "heads" in method.settings else needs
 
 
 def main() -> None:
@@ -17,8 +16,7 @@ def main() -> None:
     config_dir = config_dir_of("methods", main.__doc__)
     print("method=NAME  needs ids    boundaries  what it is")
     for method in catalogue("method", config_dir):
-        boundaries = {True: "yes", False: "no"}.get(method.facts.get("needs_boundaries"), "-")
-        print(f"{method.name:<12} {needs_ids(method):<12} {boundaries:<11} {method.comment}")
+        print(f"{method.name:<12} {needs_ids(method):<12} {method.says('needs_boundaries'):<11} {method.comment}")
     print("\ndetector=NAME  reads                 what it is")
     for detector in catalogue("detector", config_dir):
         print(f"{detector.name:<14} {detector.facts.get('reads', '-'):<21} {detector.comment}")

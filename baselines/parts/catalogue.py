@@ -36,6 +36,10 @@ class CatalogueEntry(NamedTuple):
         """The constants among the attributes of the class, read from its source without importing it; none of yours."""
         return constants(self.target) if self.target.startswith("baselines.") else {}
 
+    def says(self, fact: str) -> str:
+        """Return ``yes`` or ``no`` of a fact of a class of this package, and ``-`` of yours."""
+        return "-" if fact not in self.facts else "yes" if self.facts[fact] else "no"
+
 
 def config_dir_of(command: str, description: str | None) -> Path | None:
     """Return the ``--config-dir`` of a command that lists, which has no other argument."""

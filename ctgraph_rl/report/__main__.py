@@ -30,8 +30,8 @@ def main() -> None:
                 count=count,
             )
     incomplete = print_problems(report.problems, report.runs)
-    count = len(report.runs)
-    print(f"report of {count} run{'s' * (count != 1)}: {terminal_text(report.page)}")
+    num_runs = len(report.runs)
+    print(f"report of {num_runs} run{'s' * (num_runs != 1)}: {terminal_text(report.page)}")
     if incomplete:
         sys.exit(1)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -133,7 +132,8 @@ def write_report(
         within = len(paths) == 1 and is_writable(paths[0])
         folder = made_folder(Path(paths[0]) / "report" if within else Path("report"))
     found = sections(runs, count)
-    gallery = Gallery(Path(folder), width, chosen, partial(count, "figures", total=_most_figures(found)))
+    most = _most_figures(found)
+    gallery = Gallery(Path(folder), width, chosen, lambda done: count("figures", done, most))
     together = gallery.write((), map(experiments, [found]))  # drawn in the gallery's style
     parts = []
     missing: list[Run] = []
