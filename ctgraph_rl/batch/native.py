@@ -132,7 +132,7 @@ class Native:
         return None if wrong else (after, made)
 
     def _stepped_shapes(self) -> Stepped:
-        """Return tensors without memory of their own, of the shapes and dtypes of what rows show after a step."""
+        """Return tensors with the shapes and dtypes of what rows show after a step, of one element in memory each."""
         shapes = []
         for name in Stepped._fields:
             dtype, is_image, _ = _ARRAYS[name]

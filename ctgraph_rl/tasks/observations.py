@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from itertools import combinations
+from typing import TypeGuard
 
 from ctgraph_rl.checks import Rule, as_tuple, is_int, make_fields_plain, require, true_or_false
 from ctgraph_rl.core.graph import CTGraph, StateType
@@ -124,7 +125,7 @@ class Observations:
         return found
 
 
-def _is_range(value: object) -> bool:
+def _is_range(value: object) -> TypeGuard[Ids]:
     return isinstance(value, tuple) and len(value) == 2 and is_int(value[0], 0) and is_int(value[1], value[0])
 
 

@@ -211,7 +211,7 @@ class Protocol:
         require(*one_of(TASK_IDS, task_id=self.task_id), *one_of(BOUNDARIES, boundaries=self.boundaries))
         ids = as_tuple(self.task_ids)
         object.__setattr__(self, "task_ids", ids)
-        is_ids = ids is None or (are_ints(ids, 0, MOST_IDS) and len(ids) > 0)
+        is_ids = ids is None or (are_ints(ids, 0, MOST_IDS) and bool(ids))
         names_ids = self.task_id != "hidden" or (ids is None and self.num_task_ids is None)
         differ = not isinstance(ids, tuple) or not is_ids or len(set(ids)) == len(ids)
         hidden_gift = self.task_id == "at_boundaries" and self.boundaries == "hidden"
