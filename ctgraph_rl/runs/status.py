@@ -13,16 +13,16 @@ from contextlib import contextmanager, suppress
 from datetime import timedelta
 from pathlib import Path
 from types import TracebackType
-from typing import NamedTuple
-
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn
+from typing import TYPE_CHECKING, NamedTuple
 
 from ctgraph_rl.disk import read_regular, read_text, write_whole
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CHECKPOINTS, FAILURE, LOCK, LOG, METRICS, MOST_BYTES_OF_A_REASON
 from ctgraph_rl.log.sums import MOST_BYTES_OF_SUMS, SUMS, is_complete
 from ctgraph_rl.runs import config
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 DONE = "done"
 STALE = "stale"
@@ -176,6 +176,9 @@ class SweepProgress:
     """
 
     def __init__(self, cells: Mapping[Path, RunOutcome], console: Console | None = None) -> None:
+        from rich.console import Console  # here: --help shows no bar
+        from rich.progress import BarColumn, Progress, TextColumn  # here: as above
+
         self.total = len(cells)
         self.console = Console(stderr=True) if console is None else console
         self._left = dict(cells)
