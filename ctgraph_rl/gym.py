@@ -254,7 +254,8 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         if self.autoreset_mode == AutoresetMode.SAME_STEP and done.any():
             shown, infos = self._restart(done, shown)
         else:
-            self._is_over, infos = done, self._infos(shown)
+            self._is_over = done
+            infos = self._infos(shown)
         observation = with_id(shown.observation.numpy(), self._ids, self._numbers)
         return observation, rewards, done.copy(), np.zeros_like(done), infos
 

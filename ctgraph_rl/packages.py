@@ -74,7 +74,8 @@ def warn_of_shadows() -> None:
 def _shadows(*names: str) -> Iterator[str]:
     """Yield what is wrong with packages of these names that are not ours."""
     for name in names:
-        spec, ours = find_spec(name), HERE.parent / name
+        spec = find_spec(name)
+        ours = HERE.parent / name
         origin = None if spec is None or spec.origin is None else Path(spec.origin).resolve()
         found = origin.parent if origin is not None and origin.name == "__init__.py" else origin
         if found != ours:

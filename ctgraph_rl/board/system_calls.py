@@ -13,10 +13,16 @@ import struct
 from collections.abc import Sequence
 from typing import NamedTuple
 
-LOAD, EQUAL, AT_LEAST, ANY_BIT, RETURN = 0x20, 0x15, 0x35, 0x45, 0x06
+LOAD = 0x20
+EQUAL = 0x15
+AT_LEAST = 0x35
+ANY_BIT = 0x45
+RETURN = 0x06
 """Instructions, from linux/bpf_common.h."""
 
-NUMBER_AT, ABI_AT, ARGUMENTS_AT = 0, 4, 16
+NUMBER_AT = 0
+ABI_AT = 4
+ARGUMENTS_AT = 16
 """Where the kernel shows the number of the call, the ABI and the arguments, from linux/seccomp.h."""
 
 ALLOW = 0x7FFF0000
@@ -29,7 +35,8 @@ X32 = 0x40000000
 NEW_NAME_SPACES = 0x7E020000
 """Flags of ``clone`` that make name spaces, from linux/sched.h."""
 
-TYPE_A_LETTER, PASTE = 0x5412, 0x541C
+TYPE_A_LETTER = 0x5412
+PASTE = 0x541C
 """Requests of ``ioctl`` that put letters into a terminal, as if they were typed there."""
 
 HIDE = 4

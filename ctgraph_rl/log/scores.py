@@ -64,10 +64,10 @@ def scores(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None
 def inputs_of(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None) -> NamedValues:
     """Return all of `ctgraph_rl.metrics.inputs.INPUTS`, `Undefined` in place of what this run does not give."""
     tasks = curriculum.tasks
-    count, best = len(tasks), optimal_values(tasks)
+    best = optimal_values(tasks)
     curves = _curves(log, curriculum)
     return {
-        "performance": log.performance(count),
+        "performance": log.performance(len(tasks)),
         "trained": curriculum.trained,
         "curves": curves,
         "mastered_returns": mastered_returns(tasks),
@@ -191,7 +191,8 @@ def mastered_returns(tasks: Sequence[TaskLike]) -> Tensor | Undefined:
     best = optimal_values(tasks)
     if isinstance(best, Undefined):
         return best
-    share, positive = metrics.MASTERED, (best > 0) | best.isnan()
+    share = metrics.MASTERED
+    positive = (best > 0) | best.isnan()
     if positive.all():
         return share * best
     worst = _of_each(partial(_known, worst_value), tasks) if are_graphs(tasks) else lowest_returns(tasks)

@@ -82,7 +82,7 @@ def write_tables(log: RunLog, folder: Path | str, parquet: bool | None = None) -
     """
     written = []
     for kind, (name, columns) in TABLES.items():
-        types = _types(log, kind, columns)
+        types = _types(kind, columns, log)
         rows = list(_rows(log, kind, list(types)))
         written.append(Path(folder) / f"{name}.csv")
         write_whole(written[-1], csv_text([list(types), *rows]))
@@ -101,9 +101,7 @@ def evaluations_parquet(logs: Iterable[RunLog]) -> bytes:
         ValueError: for more columns than a table may have.
     """
     logs = list(logs)
-    types: dict[str, str] = {}
-    for log in logs:
-        types |= _types(log, "evaluation", EVALUATIONS)
+    types = _types("evaluation", EVALUATIONS, *logs)
     rows: list[list[Any]] = []
     for log in logs:
         rows += _rows(log, "evaluation", list(types))
@@ -133,9 +131,7 @@ def write_evaluations(path: Path, runs: Sequence[tuple[str, str, RunLog]]) -> No
         ValueError, ModuleNotFoundError: as `check_table`.
     """
     check_table(path)
-    types: dict[str, str] = {}
-    for _, _, log in runs:
-        types |= _types(log, "evaluation", EVALUATIONS)
+    types = _types("evaluation", EVALUATIONS, *(log for _, _, log in runs))
     rows = []
     for agent, place, log in runs:
         for row in _rows(log, "evaluation", list(types)):
@@ -156,12 +152,16 @@ def require_parquet() -> None:
     _pyarrow(needed=True)
 
 
-def _types(log: RunLog, kind: str, columns: dict[str, tuple[str, str]]) -> dict[str, str]:
-    """Type of each column; what else the log has follows as numbers, in the order of first appearance."""
-    names = dict.fromkeys(chain(*log.of_kind(kind)))
-    require((len(names) <= MOST_COLUMNS, f"a table of {len(names):,} columns, the limit is {MOST_COLUMNS}"))
-    extra = {name: "double" for name in names if name != "kind" and name not in columns}
-    return {name: type_ for name, (type_, _) in columns.items()} | extra
+def _types(kind: str, columns: dict[str, tuple[str, str]], *logs: RunLog) -> dict[str, str]:
+    """Type of each column; what else the logs have follows as numbers, in the order of first appearance."""
+    types = {name: type_ for name, (type_, _) in columns.items()}
+    for log in logs:
+        names = dict.fromkeys(chain(*log.of_kind(kind)))
+        require((len(names) <= MOST_COLUMNS, f"a table of {len(names):,} columns, the limit is {MOST_COLUMNS}"))
+        for name in names:
+            types.setdefault(name, "double")
+    types.pop("kind", None)
+    return types
 
 
 def _rows(log: RunLog, kind: str, names: Sequence[str]) -> Iterator[list[Any]]:

@@ -146,7 +146,8 @@ def mean(values: Values, level: float = LEVEL, bounds: LowHigh = UNBOUNDED) -> E
     else:
         half = float(student(level, len(known) - 1) * np.std(known, ddof=1) / math.sqrt(len(known)))
         lowest, highest, _ = limits if within else UNBOUNDED
-        low, high = max(lowest, centre - half), min(highest, centre + half)
+        low = max(lowest, centre - half)
+        high = min(highest, centre + half)
     return Estimate(centre, low=low, high=high, n=len(known), n_undefined=missing, method=method, reason=reason)
 
 

@@ -7,7 +7,6 @@ refuses anything else.
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import pickle
@@ -23,6 +22,7 @@ import torch
 from ctgraph_rl.checks import as_path, is_int, not_negative, require, true_or_false
 from ctgraph_rl.disk import PART, made_folder, require_no_link, sync_folder, write_whole
 from ctgraph_rl.log.saved import content_of, read_plain
+from ctgraph_rl.log.sums import sum_of
 from ctgraph_rl.runs.interrupt import Interrupt
 
 FORMAT = 1
@@ -197,7 +197,7 @@ def encoded(state: RunState) -> bytes:
     except (pickle.PicklingError, AttributeError, TypeError) as error:
         raise ValueError(f"{NOT_PLAIN}: {error}") from error
     content = buffer.getvalue()
-    header = {"format": FORMAT, "frames": state["frames"], "bytes": len(content), "sha256": _digest(content)}
+    header = {"format": FORMAT, "frames": state["frames"], **sum_of(content)}
     return json.dumps(header).encode() + b"\n" + content
 
 
@@ -215,13 +215,14 @@ def decoded(path: Path) -> RunState:
     try:
         header = json.loads(head)
         version = header["format"]
-        expected = (header["bytes"], header["sha256"])
+        expected = {"bytes": header["bytes"], "sha256": header["sha256"]}
     except (ValueError, KeyError, TypeError, RecursionError):
         raise BrokenCheckpoint(f"{path} is no checkpoint, or torn; {advice}") from None
     if version != FORMAT:
         raise BrokenCheckpoint(f"{path} has format {version}, this version reads {FORMAT}; overwrite=true starts again")
-    if (len(content), _digest(content)) != expected:
-        raise BrokenCheckpoint(f"{path} is not what was written: {len(content)} of {expected[0]} bytes; {advice}")
+    if sum_of(content) != expected:
+        size = f"{len(content)} of {expected['bytes']} bytes"
+        raise BrokenCheckpoint(f"{path} is not what was written: {size}; {advice}")
     try:
         state = read_plain(content)
     except ValueError as error:
@@ -229,10 +230,6 @@ def decoded(path: Path) -> RunState:
     if not (isinstance(state, dict) and is_int(state.get("frames"), 0)):
         raise BrokenCheckpoint(f"{path} does not say after how many frames it was made; {advice}")
     return state
-
-
-def _digest(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
 
 
 def _frames(file: Path) -> int:

@@ -264,7 +264,8 @@ def _about(file: Path) -> NamedValues:
     require((is_run, f"{file} does not say what was run: its first line is missing, or it is no log of ours"))
     missing = [name for name in ABOUT if not about.get(name)]
     require((not missing, f"{file} does not say its {', '.join(missing)}; add it to the first line"))
-    config, schema = about["config"], about.get("schema", SCHEMA)
+    config = about["config"]
+    schema = about.get("schema", SCHEMA)
     has_seed = isinstance(config, dict) and is_int(config.get("seed"))
     require(
         (has_seed, f"{file} has no seed in its config; add it to the first line"),

@@ -80,7 +80,8 @@ class AgentContract:
     def test_equal_seeds_give_equal_runs(self) -> None:
         """Weights and measurements."""
         curriculum = self.curriculum()
-        (one, log), (other, again) = self.learnt(curriculum), self.learnt(curriculum)
+        one, log = self.learnt(curriculum)
+        other, again = self.learnt(curriculum)
 
         assert _without_times(log) == _without_times(again)
         assert _bytes(one.state_dict()) == _bytes(other.state_dict())
