@@ -216,7 +216,7 @@ def test_the_command_trains_an_agent_of_the_user_scores_and_draws(tmp_path):
     own = tmp_path / "conf" / "agent" / "mine.yaml"
     own.parent.mkdir(parents=True)
     shutil.copy(Path(conf_dir(), "agent", "ppo.yaml"), own)
-    words = ["profile", "--config-dir", "conf", "agent=mine", "seed=0", "curriculum.num_frames=10240"]
+    words = ["profile", "--config-dir", "conf", "agent=mine", "seed=0", "curriculum.num_frames=2048"]
     start = "from ctgraph_rl.cli import main; main()"
 
     done = subprocess.run([sys.executable, "-c", start, *words], cwd=tmp_path, capture_output=True, text=True)
