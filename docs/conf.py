@@ -33,6 +33,7 @@ myst_enable_extensions = ["attrs_block", "attrs_inline", "colon_fence", "deflist
 myst_heading_anchors = 4
 nb_execution_mode = "off"
 nb_output_stderr = "remove"
+highlight_language = "none"  # of blocks that name none, such as what a command prints
 
 html_theme = "furo"
 html_title = f"{project} {version}"
