@@ -35,7 +35,8 @@ class _Different:
 
     def each_kind(self, number: Callable[[Task, StateType], int]) -> Tensor:
         """Return a number for each kind of state of each task, flattened."""
-        return self.each(lambda task: [number(task, kind) for kind in StateType]).flatten()
+        numbers = [number(task, kind) for task in self.tasks for kind in StateType]
+        return torch.tensor(numbers, dtype=torch.int64, device=self.device)
 
     def some(self, holds: Callable[[Task], object]) -> bool:
         """Return whether something holds for a task at least."""
@@ -182,7 +183,8 @@ def _legacy_index(tasks: _Different) -> LegacyIndex:
     """A level of the tree begins with node (b^k - 1) / (b - 1), which has the legacy number b^k - 1."""
 
     def first(task: Task, level: int) -> int:
-        return task.graph.first_node(level) if level <= task.graph.depth else MAX_STATES
+        b = task.graph.branching_factor
+        return (b**level - 1) // (b - 1) if level <= task.graph.depth else MAX_STATES
 
     def shift(task: Task, level: int) -> int:
         return task.graph.branching_factor**level - 1 - first(task, level) if level <= task.graph.depth else 0
