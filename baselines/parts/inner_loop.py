@@ -12,6 +12,10 @@ deviation 1 over the steps before the adaptation, or over those after it. R is t
 linear function of observation and time (Duan et al. 2016, arXiv 1604.06778), fitted to the episodes before the
 adaptation.
 
+The step of TRPO bounds the divergence of adapted policies on the episodes that were played, not that of the policy
+before the adaptation. Once all episodes after it succeed, A is only what b misses, of standard deviation 1, and a step
+is still as long as ``max_kl`` allows: the next adapted returns can fall. Both are as published.
+
 All trials are one batch: `torch.func.vmap` runs over them. Weights change between batches, so it learns from trials
 that begin and end within one batch.
 """

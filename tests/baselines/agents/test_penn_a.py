@@ -29,9 +29,11 @@ from baselines.penn_a import (
     rearranged,
     winners,
 )
-from ctgraph_rl import Block, CTGraph, CTGraphEnv, Curriculum, evaluate
+from ctgraph_rl import Block, CTGraph, CTGraphEnv, Curriculum, Evaluation, Protocol, Task, evaluate, learn_curriculum
 from ctgraph_rl.learn.collect import collect
 from ctgraph_rl.runs.train import new_agent
+from curricula.axes import all_goals
+from curricula.published import environment
 
 SETTINGS = {
     "num_envs": 16,
@@ -51,6 +53,9 @@ SETTINGS = {
     "delete_prob": 0.06,
     "precision": 180,
 }
+
+STILL = {"learning_rate": 1e-7, "num_updates": 1}
+"""The autoencoder hardly changes."""
 
 NOTHING = Reproduction(5, crossover_prob=0, insert_prob=0, duplicate_prob=0, delete_prob=0, precision=math.inf)
 
@@ -308,6 +313,27 @@ def test_a_life_begins_with_the_first_episode_after_its_generation():
 
     assert [int(part["life"].unique()) for part in seen] == list(range(10))
     assert all((part["trial"][:, 1:] >= part["trial"][:, :-1]).all() for part in seen)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_at_depth_1_a_population_learns_to_search_and_to_search_again(seed):
+    """With the first latents: while it learns at the published rate, the autoencoder shows all but one image alike."""
+    shown = environment(1, (2, 2), (3, 3), (4, 4), fail_reward=-0.4, unique=(False, False))
+    goals = all_goals(Task.from_json(shown, (1,)))
+    halves = Block(goals, 50_000), Block(goals[::-1], 50_000)  # 10 episodes of 5 steps in 1,000 rows
+    before = Evaluation(1, at_block_ends=False)
+    curriculum = Curriculum("swap", 1, "here", halves * 30, before, Protocol(boundaries="hidden"))
+    settings = {"num_envs": 1000, "num_steps": 50, "num_trials": 4, "life_episodes": 20, "num_latents": 16}
+    agent = new_agent(curriculum, partial(PennA, **{**SETTINGS, **settings, "hidden_size": 64, **STILL}), seed)
+    torch.manual_seed(seed)
+
+    learn_curriculum(curriculum, agent, seed)
+
+    swapped = [replace(goal, goal_change=(10, 10)) for goal in goals]
+    found = evaluate(agent.policy, swapped, 800, seed=1, initial_state=agent.initial_state, episodes_per_row=20)
+    returns = found["episode_reward"].view(80, 2, 10).mean(dim=(0, 1))
+    assert returns[1:].min() >= 0.95
 
 
 def test_best_search_and_memory_score_96_5_at_depth_2_and_92_5_at_depth_3():
