@@ -192,7 +192,7 @@ def test_a_cache_that_cannot_be_made_is_refused(own_cache, monkeypatch):
     own_cache.parent.joinpath("file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(own_cache.parent / "file"))
 
-    with pytest.raises(ValueError, match=r"cannot be made .* name a folder of yours"):
+    with pytest.raises(ValueError, match=r"cannot be made .* name your folder"):
         library.library()
 
 
