@@ -333,7 +333,7 @@ def test_at_depth_1_a_population_learns_to_search_and_to_search_again(seed):
     swapped = [replace(goal, goal_change=(10, 10)) for goal in goals]
     found = evaluate(agent.policy, swapped, 800, seed=1, initial_state=agent.initial_state, episodes_per_row=20)
     returns = found["episode_reward"].view(80, 2, 10).mean(dim=(0, 1))
-    assert returns[1] > 0.85  # of the second episodes, in which the best search finds one of two goals
+    assert returns[1] > 0.85  # of the second episodes; the best search has 1
     assert returns[2:].min() >= 0.95
 
 
