@@ -135,9 +135,8 @@ def test_found_changes_and_other_alarms_are_counted_from_the_spans(made, masks):
 
     ends = {name: [float(line["average_performance"]) for line in masks[name]] for name in ("adwin", "swoks")}
     assert len(ends["adwin"]) == 5
-    assert (
-        f"(`swoks_2x4`, PPO, 5 seeds), masks driven by a test on the return end at {min(ends['adwin']):.2f}," in README
-    )
+    stays = "`swoks_2x4`, PPO, 5 seeds, stays of 384,000 frames"
+    assert f"{stays}: masks driven by a test on the return end at {min(ends['adwin']):.2f}." in README
     assert f"Masks driven by SWOKS end at {sum(ends['swoks']) / 5:.2f}" in README
 
 
