@@ -154,18 +154,3 @@ class RL2(PPO):
         after = batch["next"]
         ends = (after["done"] & (after["trial"] == self.trial_episodes))[:, :-1]
         return self._with_estimates(batch[:, :-1], batch["state_value"][:, 1:], ends, ends)
-
-
-def episodes_to_goal(ends: TensorDictBase, trial_episodes: int) -> Tensor:
-    """Return the first episode of each trial that reached the goal, to compare with E[kappa] of the graph.
-
-    Args:
-        ends: the result of `ctgraph_rl.evaluate` with ``episodes_per_row=trial_episodes``.
-        trial_episodes: episodes of a trial.
-
-    Returns:
-        The numbers of episodes, float64 [tasks, trials]; NaN where a trial did not reach it.
-    """
-    found = (ends["outcome"].squeeze(-1) == GOAL).unflatten(-1, (-1, trial_episodes))
-    first = 1 + found.int().argmax(dim=-1).double()
-    return torch.where(found.any(dim=-1), first, torch.nan)

@@ -229,11 +229,9 @@ def frames_to_mastery(curves: Curves, threshold: Tensor | float = MASTERED) -> T
     num_tasks = curves.performance.shape[1]
     needed = torch.as_tensor(threshold, dtype=curves.performance.dtype, device="cpu").expand(num_tasks)
     found = []
-    seen: set[int] = set()
-    for block, tasks in enumerate(curves.trained, 1):
-        if len(set(tasks)) == 1 and tasks[0] not in seen:
-            found.append(_frames_to(needed[tasks[0]], curves, block, tasks[0]))
-        seen.update(tasks)
+    for task, (block, *_) in curves._own_blocks.items():
+        if set(curves.trained[block - 1]) == {task}:
+            found.append(_frames_to(needed[task], curves, block, task))
     if not found:
         raise Undefined("the definition needs a block that trains one task")
     return torch.tensor(found, dtype=torch.float64, device="cpu")

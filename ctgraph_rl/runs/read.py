@@ -16,17 +16,18 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_int, is_real, repeated, require
-from ctgraph_rl.disk import read_regular, read_text
+from ctgraph_rl.disk import read_regular
 from ctgraph_rl.learn.labels import Span, label_spans
 from ctgraph_rl.learn.progress import Count, silent
 from ctgraph_rl.log.damage import metrics_of
-from ctgraph_rl.log.files import FAILURE, LOG, METRICS, MOST_BYTES_OF_A_REASON, MOST_BYTES_OF_METRICS, no_run
+from ctgraph_rl.log.files import FAILURE, LOG, METRICS, MOST_BYTES_OF_METRICS, no_run
 from ctgraph_rl.log.measurement import check, parsed
 from ctgraph_rl.log.run_log import MOST_BYTES, SCHEMA, RunLog, label_of
 from ctgraph_rl.log.sources import is_ours, targets
 from ctgraph_rl.metrics.adaptation import Adaptation
 from ctgraph_rl.runs.experts import EXPERT
 from ctgraph_rl.runs.settings import as_before, flat
+from ctgraph_rl.runs.status import failure
 from ctgraph_rl.strict import files_below, one_line_of, too_deep
 
 MODIFIED = " (modified)"
@@ -304,12 +305,7 @@ def _metrics(path: Path, log: RunLog) -> tuple[NamedValues, str | None]:
 
 def _failure(path: Path) -> str | None:
     """Why a run failed, as it says itself."""
-    try:
-        return "failed: " + " ".join(read_text(path / FAILURE, MOST_BYTES_OF_A_REASON).split())
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError) as error:
-        return f"failed: {error}"
+    return "failed: " + " ".join(failure(path).split()) if (path / FAILURE).exists() else None
 
 
 def _history(log: RunLog) -> History:

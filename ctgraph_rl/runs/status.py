@@ -110,14 +110,15 @@ def status_of(folder: Path, before: RunOutcome = NOTHING, error: str | None = No
     if error is not None:
         return Status(FAILED, error)
     if now.failure not in (None, before.failure):
-        return Status(FAILED, _failure(folder))
+        return Status(FAILED, failure(folder))
     if now.results not in (None, before.results):
         return Status(MISSING, "its results are not what was written; the next start says more")
     begun = (folder / LOG).exists() or (folder / CHECKPOINTS).exists()
     return Status(MISSING, "stopped; the next start resumes it" if begun else "not begun")
 
 
-def _failure(folder: Path) -> str:
+def failure(folder: Path) -> str:
+    """Return why a run failed, as its file says."""
     try:
         return read_text(folder / FAILURE, MOST_BYTES_OF_A_REASON)
     except (OSError, ValueError) as error:

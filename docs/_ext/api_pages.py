@@ -122,7 +122,7 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "baselines.parts.policy_gradient",
             "baselines.parts.q_learning",
             "baselines.parts.recurrent_q",
-            "baselines.rl2:TrialTrunk,episodes_to_goal",
+            "baselines.rl2:TrialTrunk",
             "baselines.parts.networks",
             "baselines.parts.inner_loop:InnerModel,Episodes,Played",
             "baselines.parts.gates:GatedNetwork",

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 PAGES = {
+    "adaptation": "studies.adaptation",
     "baselines": "studies.baselines.page",
     "board": "studies.board",
     "claims": "studies.claims",

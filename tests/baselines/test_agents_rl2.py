@@ -5,10 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 from helpers.small_agents import GREEDY, TWO_GOALS, batches
-from tensordict import TensorDict
 from torchrl.envs.utils import set_exploration_type
 
-from baselines.rl2 import episodes_to_goal
 from ctgraph_rl import Block, CTGraphEnv, Curriculum, RunLog, evaluate, learn_curriculum
 from ctgraph_rl.learn.evaluate import Evaluator
 from ctgraph_rl.tasks.curriculum import Evaluation
@@ -133,15 +131,6 @@ def test_one_step_teaches_nothing_and_is_no_error(small_agent):
     assert all(torch.equal(*pair) for pair in zip(before, agent.parameters(), strict=True))
 
 
-def test_episodes_to_the_goal_are_counted_in_every_trial():
-    outcome = torch.tensor([[3, 1, 3, 2, 3, 3, 1, 2, 3, 1, 2, 2]], dtype=torch.uint8).unsqueeze(-1)
-
-    found = episodes_to_goal(TensorDict({"outcome": outcome}, batch_size=[1, 12]), trial_episodes=3)
-
-    assert found[0, :3].tolist() == [1, 2, 3]
-    assert found[0, 3].isnan()
-
-
 @pytest.mark.slow
 def test_rl2_searches_like_the_best_policy_and_returns_to_what_it_found(build_agent):
     agent = build_agent("rl2", [TWO_GOALS])
@@ -150,8 +139,9 @@ def test_rl2_searches_like_the_best_policy_and_returns_to_what_it_found(build_ag
 
     ends = evaluate(agent.policy, [TWO_GOALS], 4000, seed=1, initial_state=agent.initial_state, episodes_per_row=40)
 
-    later_trials = episodes_to_goal(ends, 4).view(100, 10)[:, 1:]  # the first goal is always the same
-    success = (ends["outcome"] == 3).view(-1, 4).double().mean(dim=0)
+    reached = (ends["outcome"] == 3).view(100, 10, 4)
+    later_trials = 1 + reached[:, 1:].int().argmax(dim=-1).double()  # the first goal is always the same
+    success = reached.double().mean(dim=(0, 1))
     assert TWO_GOALS.graph.expected_search_episodes == 1.5
     assert later_trials.mean().item() == pytest.approx(1.5, abs=0.08)
     assert success[1:].tolist() == [1.0, 1.0, 1.0]

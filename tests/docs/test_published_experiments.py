@@ -36,7 +36,7 @@ def names_in(cell: str) -> list[str]:
 
 def curricula_with_results() -> set[str]:
     """The named curricula that raw results are of."""
-    found = {"su_b1_4tasks", "co_hard"}  # the files of the main job and of memory cells do not name their curricula
+    found = {"su_b1_4tasks", "co_hard", "nm_uniform_goals"}  # files of one curriculum do not name it
     for path in RESULTS.glob("*.csv"):
         with open(path, newline="", encoding="utf-8") as file:
             lines = csv.DictReader(file)

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import sys
+from inspect import signature
 from pathlib import Path
 
 import pytest
+import yaml
 from helpers.sweeping import UNLUCKY, command_line, configs, sweep
 
 from ctgraph_rl import run as run_module
+from ctgraph_rl.packages import conf_dir
 from ctgraph_rl.runs import status
-from ctgraph_rl.runs.sweep import sweepable
+from ctgraph_rl.runs.sweep import Sweeper, sweepable
 
 
 @pytest.mark.parametrize("whole", ["method=l2,ewc method.coeff=3", "experiment=own"])
@@ -39,6 +42,18 @@ def test_settings_of_a_variant_change_together(learned, monkeypatch, tmp_path, c
     assert command_line(monkeypatch, *chosen) == 1
     said = capsys.readouterr().err
     assert "is a sweep, seed=range(2) agent.num_envs=... agent.num_steps=...: add -m" in " ".join(said.split())
+
+
+def test_every_experiment_has_settings_that_the_sweeper_takes():
+    taken = set(signature(Sweeper.__init__).parameters)
+
+    given = {}
+    for path in sorted(Path(conf_dir(), "experiment").glob("*.yaml")):
+        settings = yaml.safe_load(path.read_text(encoding="utf-8"))
+        given[path.stem] = set(settings.get("hydra", {}).get("sweeper", {}))
+
+    assert len(given) > 20
+    assert {name: keys - taken for name, keys in given.items() if keys - taken} == {}
 
 
 @pytest.mark.parametrize("flag", ["-m", "--multi", "--multirun"])
