@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_int, is_real, repeated, require
 from ctgraph_rl.disk import read_regular
@@ -64,12 +64,9 @@ class History(NamedTuple):
     experts_together: tuple[bool, ...]  # for each single-task expert of the log, whether a group of seeds trained it
 
 
-T = TypeVar("T")
-
-
-def split_by(items: Iterable[T], key: Callable[[T], Any]) -> dict[Any, list[T]]:
+def split_by(items: Iterable[Any], key: Callable[[Any], Any]) -> dict[Any, list[Any]]:
     """Return the items of each key, in their order."""
-    found: dict[Any, list[T]] = {}
+    found: dict[Any, list[Any]] = {}
     for item in items:
         found.setdefault(key(item), []).append(item)
     return found
