@@ -28,7 +28,7 @@ def test_one_task_is_sugar_for_a_block_of_many():
     ("tasks", "num_frames", "message"),
     [
         ((), 64, r"a block needs at least one Task and nothing else, got \(\)"),
-        (("A",), 64, r"a block needs at least one Task and nothing else, got \('A',\)"),
+        (("A",), 64, r"a block needs at least one Task and nothing else, got \('A',\); a task is a Task, .* make_env"),
         (A, 0, "num_frames must be an integer >= 1, got 0"),
         (A, -64, "num_frames must be an integer >= 1, got -64"),
         (A, 64.5, "num_frames must be an integer >= 1, got 64.5"),

@@ -81,7 +81,8 @@ def are_tasks(name: str, values: object) -> list[Rule]:
         values: a tuple, or what is none.
     """
     if not isinstance(values, tuple) or not all(map(_is_value, values)):
-        return [(False, f"{name}, got {values!r:.200}")]
+        kinds = f"a task is a Task, a GymTask or a frozen dataclass with {', '.join(MEMBERS)}"
+        return [(False, f"{name}, got {values!r:.200}; {kinds}")]
     return [*map(_task_rule, dict.fromkeys(map(type, values))), _kinds_rule(values)]
 
 
