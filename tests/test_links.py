@@ -24,7 +24,7 @@ from ctgraph_rl.report.page import write_report
 from ctgraph_rl.runs.config import write_configuration
 from ctgraph_rl.runs.experts import find_or_train
 from ctgraph_rl.runs.load import load
-from ctgraph_rl.runs.status import marked_if_it_fails
+from ctgraph_rl.runs.status import mark_failure
 from ctgraph_rl.runs.trackers import Tracker, csv_logger
 
 WRITING = {
@@ -234,7 +234,7 @@ def test_why_a_run_failed_replaces_a_link(tmp_path, victims):
     run_dir = a_run(tmp_path)
     victims.plant(run_dir / "failed.txt")
 
-    with pytest.raises(ZeroDivisionError), marked_if_it_fails(run_dir):
+    with pytest.raises(ZeroDivisionError), mark_failure(run_dir):
         _ = 1 / 0
 
     assert victims.are_untouched()

@@ -21,7 +21,7 @@ from ctgraph_rl.board.isolate import Isolation, Limits, Outcome, run_isolated
 from ctgraph_rl.board.relearn import Relearning, run_dir_of
 from ctgraph_rl.board.rescore import NO_ROW, Check, differing, equal
 from ctgraph_rl.board.submission import MOST_BYTES_OF_A_FILE, Submission, SubmittedRun, counted, experts_of, log_sum
-from ctgraph_rl.board.two_samples import compared
+from ctgraph_rl.board.two_samples import compare_samples
 from ctgraph_rl.checks import are_ints, is_int, require
 from ctgraph_rl.disk import made_folder, open_own, read_regular, read_text, require_no_link, write_whole
 from ctgraph_rl.log.escape import terminal_text
@@ -359,7 +359,7 @@ def check_of_scores(submission: Submission, found: Sequence[float], what: str, l
     if not submitted or not found:
         why = f"{len(submitted)} submitted runs and {len(found)} others have a value of {score_name(submission)}"
         return Check(what, "scores of both", why, None, level=level, note=note)
-    difference = compared(submitted, found)
+    difference = compare_samples(submitted, found)
     passed = False if difference.is_lower else None if difference.is_blind else True
     expected = f"no lower than the {len(submitted)} submitted"
     return Check(what, expected, str(difference), passed, level=level, note=note)

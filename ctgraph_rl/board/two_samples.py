@@ -56,7 +56,7 @@ class Difference(NamedTuple):
         return f"mean {self.found:.4g} against {self.submitted:.4g}: {interval}, p = {self.p_value:.3g}; {power}"
 
 
-def compared(submitted: Sequence[float], found: Sequence[float]) -> Difference:
+def compare_samples(submitted: Sequence[float], found: Sequence[float]) -> Difference:
     """Test whether scores are lower than submitted ones, by all ways to split them into groups of these sizes.
 
     The chance to call equal distributions different is at most `ALPHA`, whatever they are. The interval holds all drops

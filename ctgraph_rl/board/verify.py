@@ -143,7 +143,7 @@ def planned(submission: Submission, level: str, number: int, count: int, folder:
     return Plan(submission, number, level, reruns=reruns, held_out=fresh, other_bits=other_bits, folder=folder)
 
 
-def described(plan: Plan, means: Means) -> list[str]:
+def describe_plan(plan: Plan, means: Means) -> list[str]:
     """Return lines about what will run, in which limits, and what is not isolated."""
     submission = plan.submission
     cells = plan.cells
@@ -346,7 +346,7 @@ def verify(submission: Submission, arguments: argparse.Namespace) -> list[Check]
         )
     )
     means = Means(isolated, arguments.hours, memory=arguments.memory, disk=arguments.disk, paths=paths)
-    ask(described(plan, means), arguments.yes)
+    ask(describe_plan(plan, means), arguments.yes)
     with _ended_by_signals(f"interrupted, and no process is left; with --number {number} the same command resumes"):
         checks += checks_of_plan(plan, run_plan(plan, means))
     write_verification(submission, checks, plan, means)

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from ctgraph_rl.checks import require
-from ctgraph_rl.collective.summary import COLLECTIVE, FILES, described, read_collective, write_summary
+from ctgraph_rl.collective.summary import COLLECTIVE, FILES, describe_collective, read_collective, write_summary
 from ctgraph_rl.disk import made_folder
 from ctgraph_rl.learn.collective import ExchangeLike, Member, learn_collective
 from ctgraph_rl.learn.progress import ProgressBar
@@ -30,7 +30,7 @@ from ctgraph_rl.runs.experts import Failures
 from ctgraph_rl.runs.interrupt import Interrupt
 from ctgraph_rl.runs.job import Job, code_of, first_line, is_finished, run_job
 from ctgraph_rl.runs.seeds import run_seeds
-from ctgraph_rl.runs.status import marked_if_it_fails
+from ctgraph_rl.runs.status import mark_failure
 from ctgraph_rl.runs.train import Participant, execute
 from ctgraph_rl.tasks.curriculum import Curriculum
 
@@ -53,7 +53,7 @@ def run_cells(cfg: Any, run_dir: Path) -> list[Path]:
     if "exchange" in cfg:
         run_collective(cfg, run_dir)
         if not config.in_sweep():
-            print(described(read_collective(run_dir)))
+            print(describe_collective(read_collective(run_dir)))
         return []
     if "seeds" in cfg:
         return run_seeds(cfg, run_dir)
@@ -100,7 +100,7 @@ def run_collective(cfg: Any, run_dir: Path) -> None:
             print("this configuration was run before; overwrite=true runs it again")
             shutil.rmtree(run_dir / CHECKPOINTS, ignore_errors=True)  # if it was killed at its very end
             return
-        with Interrupt() as interrupt, marked_if_it_fails(run_dir):
+        with Interrupt() as interrupt, mark_failure(run_dir):
             _learn(cfg, runs, exchange, run_dir, interrupt=interrupt)
 
 

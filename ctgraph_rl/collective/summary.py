@@ -149,7 +149,7 @@ def _learned(path: Path, number: int, about: ReadOnlyValues) -> Iterator[Learned
         start = end
 
 
-def described(collective: Collective) -> str:
+def describe_collective(collective: Collective) -> str:
     """Return a few lines on a collective."""
     about = collective.about
     num = len(collective.learned)

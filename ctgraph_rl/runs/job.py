@@ -30,7 +30,7 @@ from ctgraph_rl.runs.checkpoints import Checkpoints
 from ctgraph_rl.runs.experts import Expert, Failures, RunDirs, expert_curriculum, find_or_train, is_of_group
 from ctgraph_rl.runs.interrupt import Interrupt
 from ctgraph_rl.runs.settings import as_before, differences, flat
-from ctgraph_rl.runs.status import holds_results, marked_if_it_fails
+from ctgraph_rl.runs.status import holds_results, mark_failure
 from ctgraph_rl.runs.trackers import FOLDER, Tracker
 from ctgraph_rl.runs.train import (
     START_AGAIN,
@@ -294,13 +294,13 @@ def run_job(cfg: DictConfig, run_dir: Path, job: Job | None = None) -> None:
         if is_finished(cfg, run_dir):
             return
     with locked(run_dir):
-        with marked_if_it_fails(run_dir) if config.in_sweep() and not (run_dir / METRICS).exists() else nullcontext():
+        with mark_failure(run_dir) if config.in_sweep() and not (run_dir / METRICS).exists() else nullcontext():
             config.check_values(cfg)
             finished = is_finished(cfg, run_dir)
         if finished:
             shutil.rmtree(run_dir / CHECKPOINTS, ignore_errors=True)  # if it was killed at its very end
             return
-        with Interrupt() if job is None else job.interrupt as interrupt, marked_if_it_fails(run_dir):
+        with Interrupt() if job is None else job.interrupt as interrupt, mark_failure(run_dir):
             learn(cfg, run_dir, interrupt, job)
 
 

@@ -22,7 +22,7 @@ from ctgraph_rl.runs import config
 from ctgraph_rl.runs.experts import Expert, Failures, RunDirs, find_or_train, is_of_group
 from ctgraph_rl.runs.interrupt import Interrupt
 from ctgraph_rl.runs.job import Job, is_finished, run_job
-from ctgraph_rl.runs.status import marked_if_it_fails
+from ctgraph_rl.runs.status import mark_failure
 from ctgraph_rl.runs.train import RunDirectory, train_together
 from ctgraph_rl.tasks.curriculum import Curriculum
 
@@ -108,11 +108,11 @@ def _marked(runs: Sequence[JobAndPath], built: tuple[Job, torch.Generator] | Non
     with ExitStack() as stack:
         interrupt = stack.enter_context(Interrupt() if built is None else built[0].interrupt)
         for _, run_dir in runs:
-            stack.enter_context(marked_if_it_fails(run_dir))
+            stack.enter_context(mark_failure(run_dir))
         failed = _learn(runs, interrupt, built)
     for cfg, run_dir in runs:
         if cfg.seed in failed:
-            with suppress(FloatingPointError), marked_if_it_fails(run_dir):
+            with suppress(FloatingPointError), mark_failure(run_dir):
                 raise failed[cfg.seed]
     return failed
 

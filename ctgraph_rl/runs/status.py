@@ -71,7 +71,7 @@ def holds_results(folder: Path) -> bool:
 
 
 @contextmanager
-def marked_if_it_fails(run_dir: Path) -> Iterator[None]:
+def mark_failure(run_dir: Path) -> Iterator[None]:
     """Leave the reason in ``failed.txt`` where a run that began or failed before, or a cell, ends by an error."""
     mark = run_dir / FAILURE
     failed_before = mark.exists()

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from ctgraph_rl.board import two_samples
-from ctgraph_rl.board.two_samples import ALPHA, POWER, compared, detectable, runs_needed
+from ctgraph_rl.board.two_samples import ALPHA, POWER, compare_samples, detectable, runs_needed
 
 
 def share_found(sizes: tuple[int, int], drop: float, draw) -> float:
     samples = draw((1_000, sum(sizes)))
-    return float(np.mean([compared(row[: sizes[0]], row[sizes[0] :] - drop).p_value <= ALPHA for row in samples]))
+    return float(
+        np.mean([compare_samples(row[: sizes[0]], row[sizes[0] :] - drop).p_value <= ALPHA for row in samples])
+    )
 
 
 @pytest.mark.parametrize("sizes", [(5, 2), (10, 3)])
@@ -34,7 +36,7 @@ def test_equal_distributions_are_called_different_as_seldom_as_stated(kind, monk
 
 
 def test_a_test_that_can_find_nothing_says_so_and_how_many_runs_it_needs():
-    found = compared([1.0, 1.0, 0.9], [0.0, 0.1])
+    found = compare_samples([1.0, 1.0, 0.9], [0.0, 0.1])
 
     assert found.is_blind
     assert not found.is_lower
@@ -43,13 +45,15 @@ def test_a_test_that_can_find_nothing_says_so_and_how_many_runs_it_needs():
 
 
 def test_the_interval_of_the_drop_agrees_with_the_test():
-    found = compared([1.0, 0.9, 0.95, 1.0, 0.85], [0.5, 0.6])
+    found = compare_samples([1.0, 0.9, 0.95, 1.0, 0.85], [0.5, 0.6])
 
     assert found.is_lower
     assert 0 < found.low < 0.94 - 0.55 < found.high
-    assert compared([1.0, 0.9, 0.95, 1.0, 0.85], [0.5 + found.low + 1e-6, 0.6 + found.low + 1e-6]).is_lower is False
+    assert (
+        compare_samples([1.0, 0.9, 0.95, 1.0, 0.85], [0.5 + found.low + 1e-6, 0.6 + found.low + 1e-6]).is_lower is False
+    )
 
 
 def test_equal_scores_without_spread_are_no_drop():
-    assert not compared([1.0] * 5, [1.0] * 2).is_lower
-    assert compared([1.0] * 5, [0.99] * 2).is_lower
+    assert not compare_samples([1.0] * 5, [1.0] * 2).is_lower
+    assert compare_samples([1.0] * 5, [0.99] * 2).is_lower

@@ -227,10 +227,10 @@ def test_a_cell_that_cannot_be_started_again_stays_failed(learned, monkeypatch, 
 def test_a_mark_stays_where_a_run_alone_is_refused_again(monkeypatch, tmp_path):
     (tmp_path / "failed.txt").write_text("ValueError: before\n")
 
-    with pytest.raises(ValueError), status.marked_if_it_fails(tmp_path):
+    with pytest.raises(ValueError), status.mark_failure(tmp_path):
         raise ValueError("again")
     assert (tmp_path / "failed.txt").read_text() == "ValueError: again\n"
-    with status.marked_if_it_fails(tmp_path):
+    with status.mark_failure(tmp_path):
         pass
 
     assert not (tmp_path / "failed.txt").exists()
