@@ -11,7 +11,7 @@ from baselines.methods.method import Method
 from baselines.methods.parts.weights import Weights, flat
 from baselines.parts.learner import Learner
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import one_of, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 
@@ -34,7 +34,7 @@ class Finetune(Method):
 
     def __init__(self, trunk: str = "trained") -> None:
         super().__init__()
-        require((trunk in ("trained", "kept"), f"trunk must be trained or kept, got {trunk!r}"))
+        require(*one_of(("trained", "kept"), trunk=trunk))
         self.trunk = trunk
         self.needs_boundaries = trunk == "kept"
 
