@@ -4,20 +4,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from baselines.methods.finetune import Finetune
+from baselines.methods.method import Method
+from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import require
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Block
 from ctgraph_rl.tasks.switch import ByEpisode
 
 
-class Multitask(Finetune):
+class Multitask(Method):
     """One block with all tasks and frames replaces the curriculum's; each environment changes tasks at every episode.
 
     The agent is unchanged. Nothing is stored, and nothing can be forgotten. Without task ids only tasks that look
     different can all be solved.
     """
 
+    needs_boundaries = False
     reads_tasks = "all tasks at once"
 
     def prepare(self, curriculum: Curriculum) -> Curriculum:
@@ -37,3 +39,7 @@ class Multitask(Finetune):
         )
         at_once = Block(tasks, curriculum.num_frames, ByEpisode())
         return replace(curriculum, blocks=(at_once,))
+
+    def attach(self, agent: Agent, curriculum: Curriculum) -> Agent:
+        """Return the agent itself."""
+        return agent

@@ -22,6 +22,7 @@ from baselines.methods.__main__ import main, needs_ids
 from baselines.methods.finetune import Finetune
 from baselines.methods.l2 import L2
 from baselines.methods.method import Method
+from baselines.methods.multitask import Multitask
 from baselines.methods.parts.weights import flat
 from baselines.parts.catalogue import catalogue
 from baselines.parts.hooks import Hooks
@@ -176,7 +177,7 @@ def test_the_page_lists_the_members_that_a_method_needs(compose, name):
 
     def needed(*overrides: str) -> list[str]:
         method = target(compose(f"method={name}", *overrides), "method")()
-        return [] if isinstance(method, Finetune) else sorted(method.agent_members)
+        return [] if isinstance(method, (Finetune, Multitask)) else sorted(method.agent_members)
 
     assert needed(*["method.heads=single"] * with_heads) == sorted(members)
     if with_heads:
