@@ -211,8 +211,15 @@ def _json(table: BoardTable) -> NamedValues:
     variant = table.variant
     comparisons = []
     for (one, other), found in table.pairs.items():
-        pair = {"first": one, "second": other, "difference": _numbers(found.difference)}
-        comparisons.append({**pair, "p_value": found.p_value, "holm": found.holm})
+        comparisons.append(
+            {
+                "first": one,
+                "second": other,
+                "difference": _numbers(found.difference),
+                "p_value": found.p_value,
+                "holm": found.holm,
+            }
+        )
     return {
         "track": {"name": track.name, "version": track.version, "measures": track.measures},
         "breakthrough": track.breakthrough,
