@@ -90,10 +90,30 @@ def fewer(t):
 @reads("methods")
 def _(t):
     """With growing depth no method is distinguishable from fine-tuned PPO by the mean return at the end."""
-    found = t.against_finetuning("ppo")
-    corrected = dict(zip(found, statistics.holm([each.p_value for each in found.values()]), strict=True))
-    deep = [p for name, p in corrected.items() if name.startswith("fo_b1_depth2to5")]
-    return len(deep) == 11 and min(deep) > 0.05
+    return better(t, "ppo")["depth2to5"] == set()
+
+
+@reads("methods")
+def _(t):
+    """With the other three agents each method is better than fine-tuning between goals, each but EWC and CLEAR between
+    image sets, and none with growing depth (15 pairs, taken as independent; p <= 0.05, corrected for 33)."""
+    every = {method for method in t.swept["method"] if method != "finetune"}
+    found = better(t, "a2c", "dqn", "lstm_ppo", pairs=15)
+    return found == {"4tasks": every, "4images": every - {"ewc", "clear"}, "depth2to5": set()}
+
+
+def better(t, *agents, pairs=20):
+    """The methods that are better than fine-tuning with some agents, by what changes between tasks."""
+    found = t.against_finetuning(agents)
+    assert len(found) == 33 and {each.difference.n for each in found.values()} == {pairs}
+    corrected = statistics.holm([each.p_value for each in found.values()])
+    clear = [
+        name
+        for (name, each), p in zip(found.items(), corrected, strict=True)
+        if p <= 0.05 and each.difference.value > 0
+    ]
+    axes = ("4tasks", "4images", "depth2to5")
+    return {axis: {name.split("`")[1] for name in clear if name.startswith(f"fo_b1_{axis}")} for axis in axes}
 
 
 @pytest.fixture(scope="module")
@@ -123,6 +143,21 @@ def test_five_seeds_of_twenty_can_all_solve_four_depths_by_chance(by_agent):
         "In seeds 0 to 4 fine-tuned PPO solves all four depths, as five seeds drawn from the twenty do in one of eight"
     )
     assert said in " ".join(PAGE.read_text(encoding="utf-8").split())
+
+
+def test_a_cell_of_ppo_has_its_mean_at_the_end_and_the_p_value_of_its_difference(by_agent):
+    found = by_agent.against_finetuning(["ppo"])
+    p_values = dict(zip(found, statistics.holm([each.p_value for each in found.values()]), strict=True))
+    table = PAGE.read_text(encoding="utf-8").split("| `fo_b1_4tasks` | `fo_b1_4images` | `fo_b1_depth2to5` |")[1]
+
+    for method in by_agent.swept["method"]:
+        cells = table.split(f"| `{method}` | ")[1].split("\n")[0].strip("| ").split(" | ")
+        for cell, axis in zip(cells, ("4tasks", "4images", "depth2to5"), strict=True):
+            runs = by_agent.runs(axis, method, "ppo")
+            ends = [float(run.performance[-1].mean()) for run in runs]
+            p_value = p_values.get(f"fo_b1_{axis}, `{method}`")
+            assert cell.split(" [")[0] == f"{sum(ends) / len(ends):.2f}"
+            assert cell.endswith("]" if p_value is None else f", p {p_value:.3f}")
 
 
 def test_ppo_has_twenty_seeds_of_each_method_and_every_other_agent_five(by_agent):

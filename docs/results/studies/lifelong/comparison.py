@@ -136,52 +136,11 @@ def bounds(column: str, lines: Raw) -> tuple[float, float]:
     return METRICS[OF_A_RUN[column]].bounds(known)
 
 
-def learned(name: str) -> str:
-    """How many seeds have each task at 0.9 or more right after learning it: methods, and the experts."""
-    of = groups(read(name), "method")
-    rows = []
-    for method in (*dict.fromkeys(expected(name)["method"]), EXPERT):
-        runs = [_solved(curves(lines), method) for lines in groups(of.get((method,), []), "seed").values()]
-        if runs:
-            rows.append([f"`{method}`", *map(str, torch.stack(runs).sum(0).tolist())])
-    if not rows:
-        return ""
-    return table(["", *(f"task {task}" for task in range(1, len(rows[0])))], rows)
-
-
-def _solved(run: Curves, method: str) -> torch.Tensor:
-    """bool [tasks]: mastered at the end of its block, or by its expert at its end."""
-    at_end = run.performance[-1] if method == EXPERT else run.ends[1:].diagonal()
-    return at_end >= SOLVED
-
-
-def by_agent(curriculum: str) -> str:
-    """Average performance at the end, and forgetting, of every method (lines) and agent (columns) on a curriculum."""
-    lines = [line for line in read("methods") if line["curriculum"] == curriculum]
-    of, swept = groups(lines, "method", "agent"), expected("methods")
-    agents = [agent for agent in swept["agent"] if any(who == agent for _, who in of)]
-    rows = [[f"`{method}`", *(_both(of.get((method, agent), [])) for agent in agents)] for method in swept["method"]]
-    heads = [f"{agent}, {seeds_of(lines, agent)}" for agent in agents]
-    return table([curriculum, *heads], rows) if agents else f"Nothing was run yet of {curriculum}."
-
-
 def seeds_of(lines: Raw, agent: str) -> str:
     """How many seeds the cells of an agent have, such as ``n = 2 to 3``."""
     cells = groups([line for line in lines if line["agent"] == agent], "curriculum", "method").values()
     counts = sorted({len(groups(cell, "seed")) for cell in cells})
     return f"n = {' to '.join(map(str, dict.fromkeys([counts[0], counts[-1]])))}"
-
-
-def _both(lines: Raw) -> str:
-    by_seed = list(groups(lines, "seed").values())
-    if not by_seed:
-        return ""
-    runs = [curves(each) for each in by_seed]
-    forgotten = [
-        metrics.continual_world_forgetting(run).value for run in runs
-    ]  # none where all tasks are learned at once
-    at_end = mean_of(returns_at_end(lines), RETURNS)
-    return at_end if None in forgotten else f"{at_end}; {mean_of(forgotten, bounds('forgetting', by_seed[0]))}"
 
 
 def returns_at_end(lines: Raw) -> list[float]:
@@ -250,6 +209,4 @@ def _thousands(run: Curves) -> torch.Tensor:
 
 def tables(names: Sequence[str] = MASKS) -> dict[str, str]:
     """What the template of the page names."""
-    found = {name: summary(name) for name in names} | {f"{name}_learned": learned(name) for name in names}
-    found |= {f"methods_{curriculum}": by_agent(curriculum) for curriculum in expected("methods")["curriculum"]}
-    return found | {"methods_missing": missing("methods")}
+    return {name: summary(name) for name in names} | {"methods_missing": missing("methods")}

@@ -7,6 +7,8 @@ from studies.lifelong.experiments import MASKS, expected
 from studies.raw import Raw, groups, mean_of, read, table
 
 COLUMNS = ("tasks learned", "known at the end")
+CURRICULA = ("CT8 multi-depth, of 8", "CT8, of 8", "CT12, of 12")
+"""Heads of the columns, in the order of `MASKS`."""
 
 
 def eight(name: str) -> str:
@@ -14,24 +16,22 @@ def eight(name: str) -> str:
     return f"epochs/{name}"
 
 
-def by_epochs(name: str) -> str:
-    """A line for each method: how many tasks it learned, and knows at the end, with 8 epochs and with one."""
-    with_eight, with_one = (groups(read(each), "method") for each in (eight(name), name))
-    of = {"8 epochs": with_eight, "1 epoch": with_one}
-    heads = ["", *(f"{column}, {epochs}" for column in COLUMNS for epochs in of)]
-    rows = [
-        [f"`{method}`", *(_cell(of[epochs][method,], column) for column in COLUMNS for epochs in of)]
-        for method in expected(name)["method"]
-    ]
-    return table(heads, rows)
+def with_eight() -> str:
+    """A line for each method, a column for each curriculum: tasks learned, and known at the end, with 8 epochs."""
+    rows = []
+    for method in expected(MASKS[0])["method"]:
+        rows.append([f"`{method}`", *(_cell(groups(read(eight(name)), "method")[method,]) for name in MASKS)])
+    return table(["", *CURRICULA], rows)
 
 
-def _cell(lines: Raw, column: str) -> str:
+def _cell(lines: Raw) -> str:
     runs = list(groups(lines, "seed").values())
-    values = [comparison.scores(run)[column] for run in runs]
-    return f"{mean_of(values, comparison.bounds(column, runs[0]))} (n = {len(runs)})"
+    found = [comparison.scores(run) for run in runs]
+    bounds = [comparison.bounds(column, runs[0]) for column in COLUMNS]
+    means = zip(COLUMNS, bounds, strict=True)
+    return "; ".join(mean_of([scores[column] for scores in found], ends) for column, ends in means)
 
 
 def tables() -> dict[str, str]:
     """What the template of the page names."""
-    return {f"{name}_epochs": by_epochs(name) for name in MASKS}
+    return {"eight_epochs": with_eight()}

@@ -99,9 +99,9 @@ class ByAgent:
         """bool [seeds, tasks]: what is mastered at the end of its block."""
         return torch.stack([run.ends[1:].diagonal() >= MASTERED for run in self.runs(axis, method, agent)])
 
-    def against_finetuning(self, agent: str) -> dict[str, statistics.Comparison]:
-        """Each method against fine-tuning with one agent on each curriculum."""
-        return pairs.against_finetuning([agent])
+    def against_finetuning(self, agents: Sequence[str]) -> dict[str, statistics.Comparison]:
+        """Each method against fine-tuning with some agents on each curriculum."""
+        return pairs.against_finetuning(agents)
 
     def keeps_and_finds(self, methods: Sequence[str]) -> tuple[bool, list[int]]:
         """Whether PPO with each method keeps all depths that it learned, and in how many seeds it learns the last."""

@@ -12,10 +12,10 @@ from collections.abc import Collection, Mapping
 
 from ctgraph_rl import metrics
 from ctgraph_rl.report import statistics
-from ctgraph_rl.report.statistics import LEVEL, Comparison
+from ctgraph_rl.report.statistics import Comparison
 from studies.lifelong import comparison
-from studies.lifelong.experiments import MASKS, MORE_SEEDS, expected
-from studies.raw import Raw, groups, read, shown, table
+from studies.lifelong.experiments import MASKS, expected
+from studies.raw import Raw, groups, mean_of, read, shown, table
 
 COMBINED, ALONE, OTHERS = ("mask_lc", "mask_blc"), "mask_ri", ("finetune", "ewc_published")
 BASE = "finetune"
@@ -70,21 +70,21 @@ def against_finetuning(agents: Collection[str]) -> dict[str, Comparison]:
     return found
 
 
-def differences() -> str:
-    """A line for each curriculum and method: its difference from fine-tuning with PPO and with the other agents."""
-    more_seeds = MORE_SEEDS["methods"]
-    others = [agent for agent in expected("methods")["agent"] if agent not in more_seeds]
-    by_ppo = _with_p_values(against_finetuning(more_seeds))
-    by_others = _with_p_values(against_finetuning(others))
-    lines = [[name, said, by_others[name]] for name, said in by_ppo.items()]
-    return table(["", "PPO", "other agents"], lines)
-
-
-def _with_p_values(found: Mapping[str, Comparison]) -> dict[str, str]:
-    """Each difference with its p-value, corrected for all of them."""
-    corrected = statistics.holm([each.p_value for each in found.values()])
-    named = zip(found.items(), corrected, strict=True)
-    return {name: f"{shown(each.difference)}, p {_p(p)}" for (name, each), p in named}
+def by_ppo() -> str:
+    """A line for each method, a column for each curriculum: PPO's return at the end, and p against fine-tuning."""
+    cells = groups([line for line in read("methods") if line["agent"] == "ppo"], "method", "curriculum")
+    found = against_finetuning(["ppo"])
+    corrected = dict(zip(found, statistics.holm([each.p_value for each in found.values()]), strict=True))
+    swept = expected("methods")
+    lines = []
+    for method in swept["method"]:
+        line = [f"`{method}`"]
+        for curriculum in swept["curriculum"]:
+            mean = mean_of(comparison.returns_at_end(cells[method, curriculum]), comparison.RETURNS)
+            p_value = corrected.get(f"{curriculum}, `{method}`")
+            line.append(mean if p_value is None else f"{mean}, p {_p(p_value)}")
+        lines.append(line)
+    return table(["", *(f"`{curriculum}`" for curriculum in swept["curriculum"])], lines)
 
 
 def of_pairs(measured: Mapping[tuple[str, ...], float], first: str, second: str) -> Comparison:
@@ -102,15 +102,12 @@ def rows(found: Mapping[str, Comparison]) -> str:
     """A line for each comparison, its p-value corrected for all of them."""
     corrected = statistics.holm([each.p_value for each in found.values()])
     lines = [_row(name, each, p) for (name, each), p in zip(found.items(), corrected, strict=True)]
-    return table(["", "difference", "pairs", "better, equal, worse", "p", "p (Holm)", ""], lines)
+    return table(["", "difference", "pairs", "better, equal, worse", "p (Holm)"], lines)
 
 
 def _row(name: str, each: Comparison, corrected: float | None) -> list[str]:
     record = ", ".join(map(str, (each.wins, each.ties, each.losses)))
-    n = each.difference.n
-    clear = corrected is not None and corrected <= 1 - LEVEL
-    said = "" if clear else f"not distinguishable with {n} pairs"
-    return [name, shown(each.difference), str(n), record, *map(_p, (each.p_value, corrected)), said]
+    return [name, shown(each.difference), str(each.difference.n), record, _p(corrected)]
 
 
 def _p(value: float | None) -> str:
@@ -119,4 +116,4 @@ def _p(value: float | None) -> str:
 
 def tables() -> dict[str, str]:
     """What the template of the page names."""
-    return {"claims": rows(claims()), "against_finetuning": differences()}
+    return {"claims": rows(claims()), "methods_ppo": by_ppo()}

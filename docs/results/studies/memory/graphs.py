@@ -44,23 +44,6 @@ POOR = 1
 OF_CLAIM = [SHARED, TO_FIND[0], UNIQUE, TO_FIND[1]]
 
 
-def entry(lines: Raw | None) -> str:
-    """Return the seeds that solve the task, in brackets at any evaluation, and the greedy and the training return."""
-    if not lines:
-        return "not run"
-    means = (f"{mean(lines, key):.2f}" for key in ("greedy_return", "training_return"))
-    return f"{sum(solved(lines))} ({sum(solved_once(lines))}); {'; '.join(means)}"
-
-
-def return_table(conditions: list[Condition]) -> str:
-    """Return a line for each agent and a column for each condition."""
-    of = columns(conditions)
-    rows = [[AGENTS[name], *(entry(each.get(name)) for each in of.values())] for name in AGENTS]
-    ceilings = (ceiling(each) for each in of.values())
-    rows.append(["*best policy without memory*", *(f"*{value:.2f}*" for value in ceilings)])
-    return table(["", *(condition.graph for condition in of)], rows)
-
-
 def ceiling(of: Mapping[str, Raw]) -> float:
     """Return the best return without memory on a graph."""
     return float(next(iter(of.values()))[0]["ceiling_without_memory"])
@@ -120,7 +103,7 @@ def total_table() -> str:
 
 
 def distinguishable() -> tuple[str, str]:
-    """Return the agents whose returns are lower than the LSTM's, p <= 0.05 after Holm, and those not distinguishable.
+    """Return how many agents have lower returns than the LSTM, p <= 0.05 after Holm, and those not distinguishable.
 
     Raises:
         ValueError: for an agent with higher returns, of which the page has no word.
@@ -131,7 +114,7 @@ def distinguishable() -> tuple[str, str]:
         if p <= 0.05 and (comparison.difference.value or 0) > 0:
             raise ValueError(f"{name} has higher returns than the LSTM: the page says otherwise")
         (lower if p <= 0.05 else alike).append(AGENTS[name])
-    return listed(lower), listed(alike)
+    return str(len(lower)), listed(alike)
 
 
 def lost() -> str:
@@ -180,18 +163,13 @@ def claim_table() -> str:
 
 def short(lines: Raw | None) -> str:
     """Return the seeds that solve the task after training, in brackets at any evaluation."""
-    return f"{count(lines)} ({sum(solved_once(lines))})" if lines else "not run"
+    return f"{sum(solved(lines))} ({sum(solved_once(lines))})" if lines else "not run"
 
 
-def verdict_table() -> str:
-    """Return a line for each graph that the claim can be about: the rivals that do poorly there, and the others."""
-    rows = []
-    for condition, of in columns(OF_CLAIM).items():
-        poor = [AGENTS[name] for name in RIVALS if name in of and sum(solved(of[name])) <= POOR]
-        others = [AGENTS[name] for name in RIVALS if name in of and AGENTS[name] not in poor]
-        lists = (", ".join(names) or "none" for names in (poor, others))
-        rows.append([f"{condition.decisions} decisions, {condition.rewards}", *lists])
-    return table(["", "agrees", "does not agree"], rows)
+def better_than_poor(condition: Condition) -> str:
+    """Return the rivals that more than `POOR` seeds solve a graph with."""
+    of = columns([condition])[condition]
+    return listed([AGENTS[name] for name in RIVALS if sum(solved(of[name])) > POOR])
 
 
 def intervals() -> str:

@@ -1,4 +1,4 @@
-"""The search and the ladder: tables and sentences of graphs whose episodes get longer, for `memory_cells`.
+"""The search and the ladder: sentences of graphs whose episodes get longer, for `memory_cells`.
 
 memory_ladder.csv has the runs of two experiments. ``memory_search`` tries some values of `SETTINGS` for each cell on
 one graph with the seeds of `SEARCHED`; ``memory_ladder`` gives each cell the setting that did best there.
@@ -6,8 +6,8 @@ one graph with the seeds of `SEARCHED`; ``memory_ladder`` gives each cell the se
 
 from __future__ import annotations
 
-from studies.memory.runs import AGENTS, CELLS, SEEDS, SETTINGS, count, mean, ranking, solved
-from studies.raw import Raw, groups, read, table
+from studies.memory.runs import CELLS, SEEDS, SETTINGS, count, mean, ranking
+from studies.raw import Raw, groups, read
 
 NAME = "memory_ladder"
 
@@ -42,18 +42,6 @@ def best(agent: str) -> tuple[str, ...]:
     return max(of, key=lambda setting: score(of[setting]))
 
 
-def search_table() -> str:
-    """Return a line for each cell and a column for each setting, the best one in bold."""
-    of = searched()
-    settings = list(dict.fromkeys(setting for each in of.values() for setting in each))
-    rows = []
-    for name in (name for name in CELLS if name in of):
-        scores = {setting: f"{score(lines):.2f}" for setting, lines in of[name].items()}
-        scores[best(name)] = f"**{scores[best(name)]}**"
-        rows.append([AGENTS[name], *(scores.get(setting, "not run") for setting in settings)])
-    return table(["", *(f"{steps} / {rate} / {entropy}" for _, steps, rate, entropy in settings)], rows)
-
-
 def finished() -> dict[tuple[str, str], dict[str, Raw]]:
     """Return the lines of each rung and cell with all seeds, which have one setting."""
     found: dict[tuple[str, str], dict[str, Raw]] = {}
@@ -62,27 +50,6 @@ def finished() -> dict[tuple[str, str], dict[str, Raw]]:
         if len(own) == SEEDS:
             found.setdefault((depth, length), {})[agent] = own
     return {rung: {agent: of[agent] for agent in CELLS if agent in of} for rung, of in found.items()}
-
-
-def entry(lines: Raw | None) -> str:
-    """Return the seeds that solve the task, the greedy and the training return, and the training length."""
-    if not lines:
-        return "not run"
-    numbers = (mean(lines, key) for key in ("greedy_return", "training_return", "training_length"))
-    return "{}; {:.2f}; {:.2f}; {:.0f}".format(sum(solved(lines)), *numbers)
-
-
-def ladder_table(depth: str) -> str:
-    """Return a line for each cell, a column for each expected length at a depth."""
-    of = finished()
-    lengths = [length for each, length in RUNGS if each == depth]
-    rows = [[AGENTS[name], *(entry(of.get((depth, length), {}).get(name)) for length in lengths)] for name in CELLS]
-    ceilings = (line["ceiling_without_memory"] for line in read(NAME) if line["depth"] == depth)
-    value = f"*{float(next(ceilings)):.2f}*"
-    rows.append(["*best policy without memory*", *[value] * len(lengths)])
-    return table(
-        ["", *(f"{length} steps, {round(int(length) / (int(depth) + 1), 1):g} apart" for length in lengths)], rows
-    )
 
 
 def texts() -> dict[str, str]:

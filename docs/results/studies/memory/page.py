@@ -11,7 +11,7 @@ from pathlib import Path
 from string import Template
 
 from studies.memory import figures, graphs, ladder
-from studies.memory.conditions import GIVEN, NAME, SHARED, TO_FIND, UNIQUE, Condition, finished
+from studies.memory.conditions import NAME, SHARED, TO_FIND, UNIQUE, Condition, finished
 from studies.memory.runs import AGENTS, SETTINGS, count, measured, ranking
 from studies.raw import HERE, TEMPLATES, Raw, grow, lost, machines, merged
 
@@ -75,23 +75,14 @@ def texts() -> dict[str, str]:
                 found[f"{place}{middle}{end}"] = count(on_unique.get(name))
     found["lower"], found["alike"] = graphs.distinguishable()
     found |= {"lost": graphs.lost(), "with_noise": graphs.with_noise()}
+    found |= {"solve_shared": graphs.better_than_poor(SHARED), "solve_unique": graphs.better_than_poor(UNIQUE)}
     return found | ladder.texts() | {"intervals": graphs.intervals()}
 
 
 def page() -> str:
     """Return the page: the template with its tables and numbers."""
     template = Template((TEMPLATES / "memory.md").read_text(encoding="utf-8"))
-    tables = {
-        "totals": graphs.total_table(),
-        "no_waits": graphs.return_table(GIVEN[:1]),
-        "some_waits": graphs.return_table(GIVEN[1:5]),
-        "long_waits": graphs.return_table(GIVEN[5:]),
-        "to_find": graphs.return_table(TO_FIND),
-        "claim": graphs.claim_table(),
-        "verdicts": graphs.verdict_table(),
-        "search": ladder.search_table(),
-        **{f"ladder_depth_{depth}": ladder.ladder_table(depth) for depth in "234"},
-    }
+    tables = {"totals": graphs.total_table(), "claim": graphs.claim_table()}
     return template.substitute(tables, machines=machines(NAME, ladder.NAME), **texts())
 
 
