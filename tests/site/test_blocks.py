@@ -30,7 +30,7 @@ from ctgraph_rl import cli, packages, parsers
 PAGES = {
     path.relative_to(CHECKOUT).as_posix(): path
     for path in sorted([CHECKOUT / "README.md", *(CHECKOUT / "docs").rglob("*.md")])
-    if not {"generated", "_build", "templates"} & {*path.parts}
+    if not {"generated", "_build", "templates"} & {*path.relative_to(CHECKOUT).parts}
 }
 ELSEWHERE = {
     "README.md": "test_readme",

@@ -28,7 +28,7 @@ def words(text: str, of: str = "[A-Za-z]") -> int:
 PAGES = {
     path.relative_to(CHECKOUT).as_posix(): prose(path)
     for path in sources((".md", ".ipynb"))
-    if path.is_relative_to(CHECKOUT / "docs") and not {"templates", "board"} & {*path.parts}
+    if path.is_relative_to(CHECKOUT / "docs") and not {"templates", "board"} & {*path.relative_to(CHECKOUT).parts}
 }
 
 

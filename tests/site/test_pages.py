@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
-from helpers.paths import CHECKOUT, sources
+from helpers.paths import CHECKOUT, TESTS, sources
 
 TEXTS = (".md", ".ipynb", ".py", ".yaml", ".toml", ".cff")
 
@@ -23,7 +23,7 @@ def prose(path: Path) -> str:
 
 
 FILES = sources(TEXTS)
-PAGES = [path for path in FILES if path.suffix in (".md", ".ipynb") and "tests" not in path.parts]
+PAGES = [path for path in FILES if path.suffix in (".md", ".ipynb") and not path.is_relative_to(TESTS)]
 
 
 def test_every_page_of_docs_that_a_file_names_exists():
