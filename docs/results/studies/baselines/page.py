@@ -8,7 +8,6 @@ from string import Template
 from typing import TYPE_CHECKING
 
 from studies.baselines import main_job, search, swap
-from studies.baselines.instances import MEMORY, instances_change
 from studies.baselines.runs import AGENTS, BY_FIVES, EPISODES, REWARDS_MET
 from studies.raw import HERE, TEMPLATES, Raw, groups, machines, mean_of, read, share_of, table
 
@@ -17,9 +16,6 @@ if TYPE_CHECKING:
     from ctgraph_rl.report.intervals import Bounds
 
 PAGE = HERE / "baselines.md"
-SMALL = ("fo_b1", "su_b1", "co_b1", "posr_b1")
-"""The configurations of which each goal was learned alone."""
-
 OF_GOALS = (search.NAME, swap.NAME)
 """Tables of goals that change."""
 
@@ -54,20 +50,6 @@ def by_goal(raw: Raw, configuration: str) -> str:
             blind = (open_loop_ceiling(task_of(configuration, goal)) for goal in goals)
             rows.append(["*ceiling without observations*", *(f"*{value:.2f}*" for value in blind)])
     return table([configuration, *(f"goal {goal}" for goal in goals)], rows)
-
-
-def remembering() -> Raw:
-    """The cells of agents with memory, those of LSTM-PPO on the same goals first."""
-    others = read(MEMORY)
-    goals = {(line["configuration"], line["task"]) for line in others}
-    known = [line for line in read("baselines_b1") if line["agent"] == "lstm_ppo"]
-    return [line for line in known if (line["configuration"], line["task"]) in goals] + others
-
-
-def memory_tables() -> str:
-    """A table for each configuration on which other agents with memory were run."""
-    raw = remembering()
-    return "\n\n".join(by_goal(raw, name) for name in dict.fromkeys(line["configuration"] for line in raw))
 
 
 def both_ways(lines: Raw, configuration: str, goal: str) -> str:
@@ -128,19 +110,8 @@ def ladder(raw: Raw) -> str:
 
 
 def solved(lines: Raw) -> str:
-    """How many seeds have a greedy success of at least 0.9, and the mean return."""
-    if not lines:
-        return ""
-    share = share_of([float(line["greedy_success"]) >= 0.9 for line in lines])
-    return f"{share}; {cell(lines, 'greedy_return')}"
-
-
-def performance_table(raw: Raw) -> str:
-    """The performance matrix of the main job, mean over seeds."""
-    of = groups(raw, "block", "label")
-    blocks, tasks = (list(dict.fromkeys(line[key] for line in raw)) for key in ("block", "label"))
-    rows = [[block, *(cell(of[block, task], "return_mean") for task in tasks)] for block in blocks]
-    return table(["after block", *tasks], rows)
+    """How many seeds have a greedy success of at least 0.9."""
+    return share_of([float(line["greedy_success"]) >= 0.9 for line in lines]) if lines else ""
 
 
 def learned_and_met() -> dict[str, str]:
@@ -155,14 +126,10 @@ def learned_and_met() -> dict[str, str]:
     return found
 
 
-def verdicts() -> dict[str, str]:
-    """Return what the page says first of instances, of other agents with memory and of the search."""
-    depth_2 = [line for line in read(search.NAME) if line["depth"] == "2"]
-    found = search.searching(depth_2)
-    return {
-        "instances_change": instances_change(),
-        "searching": f"{sum(found)} of {len(found)}",
-    }
+def searching() -> str:
+    """Return how many seeds learned to search at depth 2."""
+    found = search.searching([line for line in read(search.NAME) if line["depth"] == "2"])
+    return f"{sum(found)} of {len(found)}"
 
 
 def reruns() -> dict[str, str]:
@@ -177,23 +144,18 @@ def reruns() -> dict[str, str]:
 
 def page() -> str:
     """The page: the template with its tables."""
-    on_depths, on_co_b1 = map(read, RND)
-    small = read("baselines_b1") + on_co_b1
-    tables = {name: by_goal(small, name) for name in SMALL}
-    tables |= {"memory": memory_tables(), "observability": search.observability_table()}
-    tables |= {f"search_{depth}": search.search_table(depth) for depth in (2, 3)}
-    tables |= {
+    tables = {
+        "su_b1": by_goal(read("baselines_b1"), "su_b1"),
         "fo_b2": by_goal(read("baselines_fo_b2"), "fo_b2"),
-        "depth_ladder": ladder(read("depth_ladder") + on_depths),
+        "depth_ladder": ladder(read("depth_ladder") + read("rnd_depth")),
     }
     template = Template((TEMPLATES / "baselines.md").read_text(encoding="utf-8"))
     return template.substitute(
         tables,
-        main_job=performance_table(read("main_job")),
+        searching=searching(),
         machines=machines("main_job", *AGENTS, *RND, *BY_FIVES, *OF_GOALS),
         **learned_and_met(),
         **swap.texts(),
-        **verdicts(),
         **reruns(),
     )
 

@@ -1,4 +1,4 @@
-"""Success in each episode of a trial with a goal of its own, beside the best search; and what observations tell."""
+"""Success in each episode of a trial with a goal of its own."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from studies.raw import Raw, groups, machine_of, mean_of, read, share_of, table
+from studies.raw import Raw, groups, machine_of
 
 if TYPE_CHECKING:
     from ctgraph_rl.runs.load import Trained
@@ -78,45 +78,7 @@ def successes(trained: Trained, greedy: bool) -> list[float]:
     return (ends["outcome"] == 3).view(-1, n).double().mean(0).tolist()
 
 
-def best_search(num_ends: int) -> list[float]:
-    """Return the success in each episode of a trial of the best search, min(1, i/n)."""
-    return [min(1.0, i / num_ends) for i in range(1, num_ends + 1)]
-
-
-def search_table(depth: int) -> str:
-    """A column for each episode of a trial; the seeds that learned to search; nothing where no five seeds were run."""
-    lines = [line for line in read(NAME) if line["depth"] == str(depth)]
-    if not lines:
-        return f"Depth {depth} has no five seeds yet."
-    episodes = groups(lines, "episode")
-    agent, frames = lines[0]["agent"], int(lines[0]["frames"])
-    head = [f"depth {depth}, {frames:,} frames", *(f"episode {i}" for (i,) in episodes), "seeds that search"]
-    shares = [mean_of([float(line["greedy_success"]) for line in each], (0, 1)) for each in episodes.values()]
-    best = best_search(len(episodes))
-    rows = [
-        ["*best search*", *(f"*{share:.3g}*" for share in best), ""],
-        [f"`{agent}`", *shares, share_of(searching(lines))],
-    ]
-    return table(head, rows)
-
-
 def searching(lines: Raw) -> list[bool]:
     """Return for each seed whether it finds the goal by the last episode of a trial."""
     last = max(int(line["episode"]) for line in lines)
     return [float(line["greedy_success"]) >= SOLVED for line in lines if int(line["episode"]) == last]
-
-
-def observability_table() -> str:
-    """States per observation, and H(state | observation) under three policies, of the paper's five configurations."""
-    from ctgraph_rl.tasks.configurations import CONFIGURATIONS
-    from ctgraph_rl.tasks.observability import state_entropy, states_per_observation
-
-    head = ["", "wait", "decision", "end", "H random", "H navigating", "H optimal"]
-    rows = []
-    for name, make in CONFIGURATIONS.items():
-        task = make()
-        counts = [str(count) for count in states_per_observation(task).values()]
-        rows.append(
-            [name, *counts, *(f"{state_entropy(task, who):.2f}" for who in ("random", "navigation", "optimal"))]
-        )
-    return table(head, rows)

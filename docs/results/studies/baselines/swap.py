@@ -6,12 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from studies.raw import Raw, groups, machine_of, mean_of, read, table, write
+from studies.raw import Raw, groups, machine_of, read, write
 
 NAME = "rl2_swap"
-
-RETURNS = (-0.4, 1.0)
-"""The lowest and the highest return of an episode."""
 
 LEARNED = 0.9
 """The least greedy return of a goal that is learned."""
@@ -53,11 +50,6 @@ def runs() -> dict[tuple[str, ...], Raw]:
     return groups(read(NAME), "seed")
 
 
-def at_end(lines: Raw, block: str, task: str) -> float:
-    """Return the greedy return on a task after a block."""
-    return [float(line["greedy_return"]) for line in lines if (line["block"], line["task"]) == (block, task)][-1]
-
-
 def frames_to_learn(lines: Raw) -> int | None:
     """Return the frames from the swap to the first evaluation with the new goal learned; None: there is none."""
     swap = max(int(line["frames"]) for line in lines if line["block"] == "1")
@@ -66,24 +58,12 @@ def frames_to_learn(lines: Raw) -> int | None:
     return found[0] if found else None
 
 
-def swap_table() -> str:
-    """Return the greedy returns on both goals after each half: means over seeds with their intervals."""
-    of = list(runs().values())
-    rows = [
-        [f"after half {block}", *(mean_of([at_end(lines, block, task) for lines in of], RETURNS) for task in "12")]
-        for block in "12"
-    ]
-    return table(["greedy return", "first goal", "second goal"], rows)
-
-
 def texts() -> dict[str, str]:
     """Return what the template of the page names."""
     of = list(runs().values())
     times = [frames_to_learn(lines) for lines in of]
     found = [time for time in times if time is not None]
     return {
-        "swap": swap_table(),
-        "swap_seeds": str(len(of)),
         "swapped": f"{len(found)} of {len(of)}",
         "swap_frames": f"{min(found):,} to {max(found):,}",
     }
