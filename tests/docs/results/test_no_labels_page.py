@@ -111,7 +111,7 @@ def test_found_changes_and_other_alarms_are_counted_from_the_spans(made, masks):
         assert within["learned"] == "False"
 
     assert (len(found), len(missed), max(found)) == (31, 4, 9216)
-    assert "*ADWIN* has an alarm within 9,216 frames of 31 of the 35 changes. The other four came while labels" in PAGE
+    assert "ADWIN has an alarm within 9,216 frames of 31 of the 35 changes. The other four came while labels" in PAGE
     false = {
         name: round(sum(float(line["false_alarms"]) * int(line["frames"]) / PER for line in masks[name]))
         for name in ("adwin", "swoks", "swoks, fresh")
@@ -126,7 +126,10 @@ def test_found_changes_and_other_alarms_are_counted_from_the_spans(made, masks):
     said = f"Of its {both[0]} other alarms {both[1]} are false and {both[0] - both[1]} late, and {both[2]} come while"
     assert f"{said} the return is at least 0.9" in PAGE
     fresh, published = ([of[name] for of in (false, number, high)] for name in ("swoks, fresh", "swoks"))
-    assert f"With fresh trials {fresh[0]} of its {fresh[1]} other alarms are false, and {fresh[2]} came while" in PAGE
+    assert (
+        f"SWOKS: with fresh trials {fresh[0]} of its {fresh[1]} other alarms are false, and {fresh[2]} came while"
+        in PAGE
+    )
     assert f"with published ones {published[0]} and {published[2]} of {published[1]}." in PAGE
     second = next(span for span in spans[tuple(swoks[1][key] for key in RUN)] if int(span["end"]) > 442_368)
     assert (second["start"], second["label"], second["learned"]) == ("442368", "1", "True")
@@ -141,7 +144,7 @@ def test_found_changes_and_other_alarms_are_counted_from_the_spans(made, masks):
 
 
 def test_amd_finds_the_changed_transition_and_forgets_nothing(made):
-    pair = made.finished()[made.PAIR, "51200"]
+    pair = made.finished()["dick2020_pair", "51200"]
 
     assert [
         (line["delays"], line["false_alarms"], line["labels_per_task"], line["final_returns"]) for line in pair["amd"]
@@ -154,13 +157,16 @@ def test_amd_finds_the_changed_transition_and_forgets_nothing(made):
 
 
 def test_with_longer_stays_all_detectors_keep_both_graphs_at_their_price(made):
-    long = made.finished()[made.PAIR, "204800"]
+    long = made.finished()["dick2020_pair", "204800"]
 
     assert {line["final_returns"] for name in ("amd", "swoks, fresh", "adwin") for line in long[name]} == {"1 1"}
-    assert "Now SWOKS and ADWIN, too, end with a return of 1 on both tasks in all seeds" in PAGE
+    assert (
+        "With stays of 204,800 frames SWOKS and ADWIN, too, end with a return of 1 on both tasks in all seeds" in PAGE
+    )
     for name in ("swoks, fresh", "adwin"):
         for key in ("frames_not_learned", "frames_rolled_back"):
             assert {round(float(line[key]) / float(line["frames"]), 2) for line in long[name]} == {0.1}
+    assert "a tenth of the frames is not learned from, and a tenth undone" in PAGE
     free = {(line["frames_not_learned"], line["frames_rolled_back"], line["delays"]) for line in long["amd"]}
     assert free == {("0.0", "0.0", "16384")} and "pays with its delay of two batches only" in PAGE
 

@@ -8,14 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cache
-from itertools import product
-from statistics import fmean, median, variance
+from statistics import fmean, variance
 
 from studies.collectives.runs import BLOCKS
 from studies.raw import Raw, groups, mean_of, numbers_in, read, table
 
-CURRICULUM, DEPTHS, BATCH = "ct28_mosaic_skips_d5", range(2, 10), 512
-"""The curriculum of MOSAIC's members, a task each, the depths of its tasks, and frames of a batch."""
+CURRICULUM, DEPTHS = "ct28_mosaic_skips_d5", range(2, 10)
+"""The curriculum of MOSAIC's members, a task each, and the depths of its tasks."""
 
 HALF, ALL = "14", "28"
 """Members of the collectives: of the first two families of tasks, or of all four."""
@@ -32,8 +31,6 @@ COLUMNS = (
     ("isolated", "isolated", HALF, ALONE),
     ("MOSAIC", "mosaic", ALL, SHARED),
     ("MOSAIC without similarity", "mosaic_no_similarity", ALL, ()),
-    ("MOSAIC, 14 members", "mosaic", HALF, ()),
-    ("MOSAIC without similarity, 14 members", "mosaic_no_similarity", HALF, ()),
 )
 """Title, exchange, members of a collective and published returns of the columns of one epoch."""
 
@@ -44,10 +41,6 @@ SUMS = {"isolated": (9.5, 1.0), "mosaic": (25.7, 0.8), "mosaic_no_similarity": (
 """Published sums of the 28 final returns, means over five seeds, with half the width of their 95 % t-interval."""
 
 NUM_PUBLISHED = 5
-
-FOUND_ALONE = ("13", "34", "69, 7 of 20", *["not stated"] * 5)
-FOUND_SHARED = ("not stated", "not stated", "32", "42", "48", "58", "68", "74")
-"""Published batches until a return of 0.9 at these depths, medians over the runs that reached it."""
 
 
 @cache
@@ -165,86 +158,18 @@ def returns_table() -> str:
     return table(["depth", *(name for name, *_ in COLUMNS)], rows)
 
 
-def epochs_table() -> str:
-    """Return the final returns with eight epochs, by depth."""
-    returns = [by_depth(exchange, HALF, "8") for exchange in ("isolated", "mosaic")]
-    rows = [
-        [str(depth), *(mean_of(each[depth], (0, 1)) for each in returns)]
-        for depth in DEPTHS
-        if all(depth in each for each in returns)
-    ]
-    return table(["depth, with 8 epochs", "isolated", "MOSAIC, 14 members"], rows)
-
-
-def times_table() -> str:
-    """Return the batches until members first have a return of 0.9, by depth, beside the published ones."""
-    found: dict[tuple[str, int], list[str]] = {}
-    for _, exchange, number, _ in COLUMNS[: len(NAMES)]:
-        for line in blocks(exchange, "1", number):
-            found.setdefault((exchange, depth_of(line)), []).append(line["frames_to_learn"])
-    rows = []
-    for depth, alone, shared in zip(DEPTHS, FOUND_ALONE, FOUND_SHARED, strict=True):
-        ours = [_batches(found.get((exchange, depth), [])) for exchange in NAMES]
-        rows.append([str(depth), f"{alone}; {ours[0]}", f"{shared}; {ours[1]}", ours[2]])
-    return table(["depth", *NAMES.values()], rows)
-
-
-def _batches(frames: Sequence[str]) -> str:
-    """Return the median number of batches of those who reached it, and how many did where not all did."""
-    reached = sorted(int(each) // BATCH for each in frames if each)
-    middle = f"{median(reached):g}" if reached else "never"
-    return f"{middle}, {len(reached)} of {len(frames)}" if 0 < len(reached) < len(frames) else middle
-
-
-def agreements() -> str:
-    """Return which published returns lie in the intervals of our own, and which do not."""
-    from ctgraph_rl.report import statistics
-
-    lines = []
-    for name, exchange, number, values_published in COLUMNS:
-        within: list[str] = []
-        beyond: list[str] = []
-        for depth, values in by_depth(exchange, number).items() if values_published else ():
-            found = statistics.mean(values, bounds=(0, 1))
-            if found.low is not None and found.high is not None:
-                is_within = found.low - 0.005 <= values_published[depth - 2] <= found.high + 0.005
-                (within if is_within else beyond).append(str(depth))
-        if within or beyond:
-            inside, outside = (", ".join(depths) or "none" for depths in (within, beyond))
-            lines.append(f"- {name}: in the interval at depth {inside}; not at {outside}.")
-    return "\n".join(lines)
-
-
 def settled(num_epochs: str) -> tuple[float, int]:
     """Return the mean share of batches below 0.9 of isolated members that once had more, and their number."""
     shares = [each for values in by_depth("isolated", HALF, num_epochs, "share_below").values() for each in values]
     return sum(shares) / len(shares), len(shares)
 
 
-def runs() -> str:
-    """Return how many seeds there are of each exchange."""
-    kinds = [(number, "1", exchange) for number, exchange in product((ALL, HALF), NAMES)]
-    kinds += [(HALF, "8", exchange) for exchange in ("isolated", "mosaic")]
-    counts = {kind: len(sums(kind[2], kind[0])) for kind in kinds if kind[1] == "1"}
-    counts |= {kind: len(groups(blocks(kind[2], "8", HALF), "seed")) for kind in kinds if kind[1] == "8"}
-    parts = [
-        f"{count} of {NAMES[exchange]} with {number} members and {epochs} epoch{'s' * (epochs != '1')}"
-        for (number, epochs, exchange), count in counts.items()
-        if count
-    ]
-    return ", ".join(parts)
-
-
 def texts() -> dict[str, str]:
     """Return what the template of the page names."""
     found = {
         "mosaic": returns_table(),
-        "mosaic_epochs": epochs_table(),
-        "mosaic_times": times_table(),
-        "agreements": agreements(),
         "mosaic_sums": sums_table(),
         "mosaic_verdicts": verdicts(),
-        "mosaic_runs": runs(),
         "never_shared": never("mosaic"),
         "never_any": never("mosaic_no_similarity"),
     }

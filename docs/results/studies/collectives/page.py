@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
-from itertools import product
 from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING, Any
@@ -60,22 +59,13 @@ def solved_blocks(num_members: str, frames: str = FRAMES, num_epochs: str = "1")
 
 
 def l2d2c_table() -> str:
-    """Return the table of collectives of L2D2-C by their number of members."""
-    head = [
-        "members",
-        "epochs",
-        "seeds",
-        "blocks solved",
-        "frames to solve",
-        "frames to a return of 0.9",
-        "final return",
-    ]
+    """Return the table of collectives of L2D2-C by their number of members, one epoch."""
+    head = ["members", "seeds", "blocks solved", "frames to solve", "frames to a return of 0.9", "final return"]
     rows = []
-    for epochs, (number, frames) in product(("1", "8"), WANTED):
-        lines = on_l2d2c(number, frames, epochs)
-        if lines:
-            name = number if frames == FRAMES else f"{number}, blocks of {int(frames):,} frames"
-            rows.append([name, epochs, str(len(lines)), *_row(number, frames, epochs), *_sharing(lines, int(number))])
+    for number, frames in WANTED:
+        lines = on_l2d2c(number, frames)
+        name = number if frames == FRAMES else f"{number}, blocks of {int(frames):,} frames"
+        rows.append([name, str(len(lines)), *_row(number, frames), *_sharing(lines, int(number))])
     return table([*head, "masks taken over", "MB"], rows)
 
 

@@ -8,7 +8,7 @@ from string import Template
 from studies.lifelong.pairs import of_pairs, rows
 from studies.no_labels import figures, task_free
 from studies.no_labels.learners import LEARNERS, finished, values
-from studies.no_labels.runs import FOUND, IMAGES, MASKS, NAME, PAIR, PLANNED, SPANS
+from studies.no_labels.runs import FOUND, IMAGES, MASKS, NAME, PLANNED, SPANS
 from studies.raw import HERE, TEMPLATES, Raw, groups, machines, mean_of, read, table
 
 PAGE = HERE / "no_labels.md"
@@ -96,39 +96,14 @@ HEAD = (
 )
 
 
-def results(curriculum: str, stay: str) -> str:
-    """Return the table of a curriculum."""
-    of = finished().get((curriculum, stay), {})
-    if not of:
-        return "No learner has all its seeds yet."
-    return table(HEAD, [row(name, lines) for name, lines in of.items()])
-
-
-def images() -> str:
-    """Return the table of the image sets of all configurations: average performance."""
-    of = {name: finished().get((name, "204800"), {}) for name in IMAGES}
-    rows = [
-        [LEARNERS[name], *(returns(each[name], "average_performance") if name in each else "" for each in of.values())]
-        for name in PLANNED[IMAGES[0], "204800"]
-    ]
-    return table(["", *(f"`{name}`" for name in IMAGES)], [cells for cells in rows if any(cells[1:])])
+def masks() -> str:
+    """Return the table of masks on four goals that come twice."""
+    return table(HEAD, [row(name, lines) for name, lines in finished()[MASKS, "384000"].items()])
 
 
 def on_images(name: str) -> Raw:
     """Return the lines of a learner on the image sets of all configurations that have all its seeds."""
     return [line for place in IMAGES for line in finished().get((place, "204800"), {}).get(name, [])]
-
-
-def image_labels() -> str:
-    """Return the table of the labels on the image sets, of all configurations together."""
-    rows = []
-    for name in PLANNED[IMAGES[0], "204800"]:
-        lines = on_images(name)
-        if lines and lines[0]["detector"]:
-            cells = row(name, lines)[4:]
-            shown = [span_of(values(lines, key), ".2f") for key in ("online_return", "label_agreement")]
-            rows.append([LEARNERS[name], str(len(lines)), *shown, *cells])
-    return table(["", "runs", *HEAD[2:]], rows)
 
 
 def compared() -> str:
@@ -182,11 +157,7 @@ def page() -> str:
     """Return the page: the template with its tables and numbers."""
     template = Template((TEMPLATES / "no_labels.md").read_text(encoding="utf-8"))
     tables = {
-        "masks": results(MASKS, "384000"),
-        "pair": results(PAIR, "51200"),
-        "long_pair": results(PAIR, "204800"),
-        "images": images(),
-        "image_labels": image_labels(),
+        "masks": masks(),
         "compared": compared(),
         "task_free": task_free.results(),
         "not_run": not_run(),
