@@ -42,6 +42,7 @@ from baselines.cells.cell import linear_layer
 from baselines.parts.distinct import distinct
 from baselines.parts.learner import require_finite
 from baselines.parts.networks import Data, guided, highest, is_greedy, num_actions_of, require_weights
+from baselines.update.update import minimise
 from ctgraph_rl.checks import TakesNumbers, at_least_one, fraction, positive, require, require_memory
 from ctgraph_rl.learn.collect import UNSTORED
 
@@ -283,7 +284,7 @@ class PennA(TakesNumbers, TensorDictModuleBase):
         life_episodes: episodes of a trial whose rewards count.
         num_latents: latents of the autoencoder.
         hidden_size: units of its other layers.
-        learning_rate: of its gradient steps.
+        learning_rate: of its gradient steps, which have momentum as published, not Adam.
         num_updates: gradient steps after a generation.
         batch_size: observations of each.
         segment_size: individuals of which the best one has all children.
@@ -445,9 +446,7 @@ class PennA(TakesNumbers, TensorDictModuleBase):
         total = torch.zeros_like(self.rewards[0])
         for _ in range(self.num_updates):
             loss = self.autoencoder.loss(seen[torch.randint(len(seen), (self.batch_size,), device=seen.device)])
-            self.optimiser.zero_grad()
-            loss.backward()
-            self.optimiser.step()
+            minimise(self.optimiser, loss)
             total += loss.detach()
         require_finite("loss_autoencoder", total)
         return total.item() / self.num_updates

@@ -34,7 +34,7 @@ from baselines.parts.learner import reset_layer
 from baselines.parts.networks import Data, Items, TensorsByName, critic, encoder, highest
 from baselines.parts.policy_gradient import generalized_advantages
 from baselines.ppo import PPO
-from baselines.update.update import make_optimiser
+from baselines.update.update import make_optimiser, minimise
 from ctgraph_rl.checks import NamedValues, at_least_one, fraction, not_negative, positive, require, require_memory
 
 LARGEST_INPUT = 5.0
@@ -218,9 +218,7 @@ class PPORND(PPO):
         """Take a gradient step of the bonus's critic on a minibatch, and of the predictor on part of it."""
         used = max(1, round(self.predictor_share * len(observations)))  # the frames are shuffled
         error = (self.bonus_values(minibatch) - target).square().mean()
-        self.bonus_optimiser.zero_grad()
-        (error + self.novelty(observations[:used]).mean()).backward()
-        self.bonus_optimiser.step()
+        minimise(self.bonus_optimiser, error + self.novelty(observations[:used]).mean())
 
     @torch.no_grad()
     def _with_advantage(self, batch: TensorDictBase) -> TensorsByName:

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn.functional import cross_entropy
 
 from baselines.models.model import Symbols, Transitions
+from baselines.update.update import minimise
 
 WIDTH = 64
 """Of the embedding and the GRU."""
@@ -42,9 +43,7 @@ class GRUModel:
         for _ in range(NUM_EPOCHS):
             for rows in torch.randperm(len(transitions.pair), generator=self.generator, device="cpu").split(16):
                 batch = Transitions(*(each[rows] for each in transitions))
-                self.optimiser.zero_grad()
-                self._nats(batch).mean().backward()
-                self.optimiser.step()
+                minimise(self.optimiser, self._nats(batch).mean())
 
     @torch.no_grad()
     def bits(self, transitions: Transitions) -> Tensor:

@@ -205,6 +205,13 @@ def _state_of(optimiser: torch.optim.Optimizer, parameter: Tensor, fused: bool) 
     return state
 
 
+def minimise(optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
+    """Take a step on a loss that all parameters of an optimiser change."""
+    gradients = torch.autograd.grad(loss, optimiser.param_groups[0]["params"])
+    with torch.no_grad():
+        step(parts_of(optimiser), gradients)
+
+
 def step(optimiser: Parts | torch.optim.Optimizer, gradients: Sequence[Tensor]) -> None:
     """Update an optimiser's parameters and state in place; one that has no `Parts` takes a step by itself."""
     if not isinstance(optimiser, Parts):
