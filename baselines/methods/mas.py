@@ -21,6 +21,7 @@ class MAS(SampledImportance):
     the last task. The arguments are those of `SampledImportance`.
     """
 
+    stackable = True
     agent_members = (*SampledImportance.agent_members, "outputs", "output_keys")
 
     def task_importance(self) -> Tensor:

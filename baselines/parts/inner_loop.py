@@ -7,7 +7,7 @@ begin with, adapts, and plays as many with the adapted ones. The inner loss is t
 
 over the E episodes of T_e steps before the adaptation. The outer loss is the same over the episodes after it, with the
 ratio of probabilities in place of log pi, and is differentiated through the inner gradient. TRPO (Schulman et al.
-2015, arXiv 1502.05477) minimises it as published, without Adam, or PPO by clipped steps of Adam. A = R - b, with mean 0 and standard
+2015, arXiv 1502.05477) minimises it as published, or PPO by clipped steps of Adam. A = R - b, with mean 0 and standard
 deviation 1 over the steps before the adaptation, or over those after it. R is the discounted rest of the episode, b a
 linear function of observation and time (Duan et al. 2016, arXiv 1604.06778), fitted to the episodes before the
 adaptation.
@@ -251,7 +251,7 @@ class InnerLoop(Learner):
         gamma: discount factor.
         gate: modulates layers, see `baselines.parts.gates`: ``none``, ``soft``, ``hard`` or ``hard_straight_through``.
         gate_size: units of a gate.
-        outer: ``trpo`` or ``ppo``.
+        outer: ``trpo``, whose step needs no Adam, or ``ppo``.
         max_kl: largest mean divergence of a step of TRPO.
         learning_rate: of PPO.
         clip_epsilon: how far the probability ratio of PPO may move.

@@ -7,6 +7,7 @@ two batches, and each agent gets its own after each batch. Each seed draws by co
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import torch
@@ -14,11 +15,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from baselines.cells.cell import PREVIOUS_ACTION
-from baselines.methods.method import AgentWithMethod
 from baselines.parts.learner import finite_means, table_of
 from baselines.parts.networks import Data, Items, TensorsByName, sequences_of
 from baselines.parts.policy_gradient import PolicyGradient
-from baselines.update.seeds import SeedGroup, or_error, sampled, why_not_optimiser
+from baselines.update.seeds import SeedGroup, learner_of, or_error, sampled, why_not_step
 from baselines.update.stack import Stack
 from baselines.update.update import update
 from ctgraph_rl.agent import Agent
@@ -31,14 +31,13 @@ AS_EVER = ("learn", "gradient_step", "minibatches", "after_update", "after_batch
 
 def why_not_captured(agent: Agent) -> str | None:
     """Return why agents like this one cannot act and learn as one batch on a GPU; None if they can."""
-    if isinstance(agent, AgentWithMethod):
-        return f"{type(agent.method).__name__} cannot be vectorised over seeds on a GPU"
-    name = type(agent).__name__
-    if not isinstance(agent, PolicyGradient) or not agent.capturable:
+    learner = learner_of(agent)
+    name = type(learner).__name__
+    if not isinstance(learner, PolicyGradient) or not learner.capturable:
         return f"{name} cannot be vectorised over seeds on a GPU"
-    if any(getattr(type(agent), own) is not getattr(PolicyGradient, own) for own in AS_EVER):
+    if any(getattr(type(learner), own) is not getattr(PolicyGradient, own) for own in AS_EVER):
         return f"{name} does not learn by the steps that a batch of seeds shares"
-    return why_not_optimiser(agent)
+    return why_not_step(learner)
 
 
 class Draws:
@@ -95,7 +94,7 @@ class CapturedGroup(SeedGroup):
     Args:
         agents: at least one, each as `ctgraph_rl.runs.train.new_agent` returns it; `why_not_captured` has no objection.
         generators: of each agent, with the state of torch's global generator after the agent was built. Nothing draws
-            from them; they say the seeds.
+            from them at a step; they say the seeds.
     """
 
     first: PolicyGradient
@@ -107,14 +106,41 @@ class CapturedGroup(SeedGroup):
         self.draws = Draws([generator.initial_seed() for generator in generators], device)
         self.device_generators = [SeedDraws(tick) for tick in self.draws.tick]
         self._region = Region(self._usual_update)
+        self._words: list[int] = []
+        """What methods draw from at the boundary of a task, a seed of torch's generators for each agent."""
 
     @property
     def stack(self) -> Stack:
         """The agents' tensors, from the first step on: a saved state is restored before that."""
         return self.stacks[0]
 
+    @contextmanager
+    def random(self, number: int) -> Iterator[None]:
+        """Let torch's global generators be those of one agent, that of the GPU, too."""
+        with super().random(number):
+            if self._words:
+                torch.manual_seed(self._words[number])
+            yield
+
+    def start_task(self, task: int | None = None) -> None:
+        """See `ctgraph_rl.agent.Agent`."""
+        self._draw_words()
+        super().start_task(task)
+
+    def end_task(self) -> None:
+        """See `ctgraph_rl.agent.Agent`."""
+        self._draw_words()
+        super().end_task()
+
+    def _draw_words(self) -> None:
+        if self.methods:
+            self._words = self.draws.words(1).flatten().tolist()
+
     def _task_has_changed(self) -> None:
-        """Read what the start of a task has changed, into the memory of the graphs."""
+        """Read what the start of a task has changed, into the memory of the graphs; a method's graphs are new."""
+        if self.methods:
+            super()._task_has_changed()
+            self._region = Region(self._usual_update)
         for stack in self._stacks:
             stack.read()
 
@@ -144,19 +170,23 @@ class CapturedGroup(SeedGroup):
 
     def learnt(self, batch: TensorDictBase) -> list[dict[str, float] | FloatingPointError]:
         """See `SeedGroup`; the host waits twice."""
+        for method, part in zip(self.methods, batch.chunk(len(self.agents)), strict=False):
+            method.on_batch(part)
         items = self._items(batch)
         steps = []
         for _ in range(self.first.num_epochs):
             for minibatch in self._minibatches(items):
-                steps.append(self.gradient_step(minibatch))
+                steps.append(self.gradient_step(self._transformed(minibatch)))
         self.stack.write()
+        for method in self.methods:
+            method.after_learning()
         columns = table_of(steps).cpu().unbind(2)
         largest = self._largest_weights().cpu()
         return [or_error(finite_means, list(steps[0]), *each) for each in zip(columns, largest, strict=True)]
 
     def _largest_weights(self) -> Tensor:
         """Return the size of the largest weight of each seed, [seeds]."""
-        weights = [self.stack.kept[name].detach().flatten(1) for name in self.stack.weights]
+        weights = [self.stack.kept[name].detach().flatten(1) for name in self.stack.learned]
         return torch.stack([each.abs().amax(dim=1) for each in weights]).amax(dim=0)
 
     @torch.no_grad()
@@ -193,6 +223,14 @@ class CapturedGroup(SeedGroup):
         order = self.draws.orders(items["action"].shape[1])
         for part in order.chunk(self.first.num_minibatches, dim=1):
             yield {key: _taken(value, part) for key, value in items.items()}
+
+    def _transformed(self, minibatch: TensorsByName) -> TensorsByName:
+        """Return what the methods learn from in place of a minibatch."""
+        if not self.methods:
+            return minibatch
+        parts = [{key: value[number] for key, value in minibatch.items()} for number in range(len(self.methods))]
+        found = [method.transform_minibatch(part) for method, part in zip(self.methods, parts, strict=True)]
+        return {key: torch.stack([each[key] for each in found]) for key in minibatch}
 
     def gradient_step(self, minibatch: TensorsByName) -> TensorsByName:
         """Take a gradient step of all seeds; return losses and norms, [seeds] each."""

@@ -32,7 +32,7 @@ LARGEST_MINIBATCH = 512
 
 def why_not_together(agent: Agent) -> str | None:
     """Return why agents like this one cannot act and learn as one batch; None if they can."""
-    learner = _learner(agent)
+    learner = learner_of(agent)
     name = type(learner).__name__
     if getattr(learner, "deduplicate", False):
         return f"{name} with deduplicate=true cannot be vectorised over seeds"
@@ -40,13 +40,14 @@ def why_not_together(agent: Agent) -> str | None:
         return f"{name} cannot be vectorised over seeds"
     if type(learner).learn is not Learner.learn or type(learner).gradient_step is not Learner.gradient_step:
         return f"{name} does not learn by the steps that a batch of seeds shares"
+    return why_not_step(learner)
+
+
+def why_not_step(learner: Learner) -> str | None:
+    """Return why the steps of a learner's method and optimiser cannot be those of several seeds; None if they can."""
     if not learner.method.stackable:
-        return f"{type(learner.method).__name__} cannot be vectorised over seeds"
-    return why_not_optimiser(learner)
-
-
-def why_not_optimiser(learner: Learner) -> str | None:
-    """Return why the step of a learner's optimiser cannot be that of several seeds; None if it can."""
+        name = type(learner.method).__name__
+        return f"{name} cannot be vectorised over seeds: its hooks take the weights of one seed"
     if has_parts(learner.optimiser):
         return None
     return f"{type(learner.optimiser).__name__} with these settings cannot be vectorised over seeds"
@@ -67,7 +68,8 @@ class SeedGroup:
     def __init__(self, agents: Sequence[Agent], generators: Sequence[torch.Generator]) -> None:
         self.agents = list(agents)
         self.generators = list(generators)
-        self.learners = [_learner(agent) for agent in agents]
+        self.learners = [learner_of(agent) for agent in agents]
+        self.methods = [agent.method for agent in agents if isinstance(agent, AgentWithMethod)]
         self.first = self.learners[0]
         self.is_stacked = _gains_from_stacking(self.first)
         self.most_at_once = _most_at_once(self.first) if self.first.compiled_step else len(self.agents)
@@ -192,9 +194,8 @@ class SeedGroup:
         return measured
 
     def _learn_stacked(self, parts: Sequence[TensorDictBase]) -> list[dict[str, float] | FloatingPointError]:
-        for agent, part in zip(self.agents, parts, strict=True):
-            if isinstance(agent, AgentWithMethod):
-                agent.method.on_batch(part)
+        for method, part in zip(self.methods, parts, strict=False):
+            method.on_batch(part)
         numbered = iter(range(len(parts)))
         return [
             measured
@@ -213,9 +214,8 @@ class SeedGroup:
         while given := self._next(minibatches):
             steps.append(self._update(stack, given, errors))
         stack.write()
-        for agent in self.agents:
-            if isinstance(agent, AgentWithMethod):
-                agent.method.after_learning()
+        for method in self.methods:
+            method.after_learning()
         names = list(steps[0])
         table = table_of(steps).unbind(-1)
 
@@ -323,5 +323,6 @@ def sampled(outputs: Mapping[str, Tensor], noise: Tensor) -> TensorsByName:
     return {"action": action, "action_log_prob": of_action, "state_value": outputs["state_value"]}
 
 
-def _learner(agent: Agent) -> Any:
+def learner_of(agent: Agent) -> Any:
+    """Return the learner that a method changes, or the agent itself."""
     return agent.agent if isinstance(agent, AgentWithMethod) else agent

@@ -14,7 +14,8 @@ from itertools import islice
 import pytest
 import torch
 from helpers.oracles import confounding
-from helpers.small_agents import POLICY_GRADIENTS, agent_of, others_slow, parameters_equal
+from helpers.scripted import ONE, THREE, of
+from helpers.small_agents import POLICY_GRADIENTS, SMALL_AGENT, agent_of, others_slow, parameters_equal
 from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -23,12 +24,14 @@ import curricula
 from baselines.parts.learner import Learner
 from baselines.update.captured import CapturedGroup
 from benchmarks.environments import configurations
-from ctgraph_rl import CTGraphEnv, Rows, RunLog, Steps, learn_curriculum, make_agent, rollout
+from ctgraph_rl import Block, CTGraphEnv, Rows, RunLog, Steps, learn_curriculum, make_agent, rollout
 from ctgraph_rl.core.region import Region
 from ctgraph_rl.learn import collect
 from ctgraph_rl.learn.collect import CapturedAct, in_time_order, start_of_episodes
+from ctgraph_rl.runs.config import target
 
 META = torch.device("meta")
+TWO_TASKS = of(Block(ONE, 8), Block(THREE, 8), task_id="at_boundaries")
 TINY = {"num_envs": 8, "num_steps": 4, "hidden_size": 8, "num_epochs": 1}
 
 
@@ -52,7 +55,8 @@ class Alone(TorchDispatchMode):
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         kwargs = kwargs or {}
-        moved = func is torch.ops.aten._to_copy.default and kwargs.get("device", args[0].device) != args[0].device
+        converted = func is torch.ops.aten._to_copy.default and isinstance(args[0], torch.Tensor)  # or a number
+        moved = converted and kwargs.get("device", args[0].device) != args[0].device
         copied = func is torch.ops.aten.copy_.default and args[1].device != args[0].device
         assert not (moved or copied), f"{func} from {args[-1].device}"
         return func(*args, **kwargs)
@@ -123,15 +127,32 @@ def test_neither_acting_nor_learning_needs_the_host(name, compose, captured, swa
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "cell"),
-    [("ppo", ()), ("a2c", ()), ("lstm_ppo", ()), ("lstm_ppo", ("cell=gru",))],
+    ("name", "settings"),
+    [
+        ("ppo", ()),
+        ("a2c", ()),
+        ("lstm_ppo", ()),
+        ("lstm_ppo", ("cell=gru",)),
+        *(("ppo", (f"method={method}",)) for method in ("scratch", "l2", "ewc", "mas", "mask_ri", "mask_lc")),
+        ("lstm_ppo", ("method=mask_blc",)),
+    ],
 )
-def test_neither_acting_nor_learning_of_several_seeds_needs_the_host(name, cell, compose, captured, swapped, request):
+def test_neither_acting_nor_learning_of_several_seeds_needs_the_host(
+    name, settings, compose, captured, swapped, request
+):
     env = CTGraphEnv([confounding(p=0.3)] * 48, kernel="off")
-    agents = [agent_of(compose, name, env, "agent.num_envs=16", *cell).to(META) for _ in range(3)]
-    for agent in agents:
-        agent.optimiser.param_groups[0] |= {"fused": False, "foreach": False}  # unknown on this device
+    cfg = compose(f"agent={name}", *SMALL_AGENT[name], "agent.num_envs=16", *settings)
+    agents = []
+    for _ in range(3):
+        agent = target(cfg, "agent")(env.observation_spec_unbatched, env.action_spec_unbatched)
+        agent = target(cfg, "method")().attach(agent, TWO_TASKS)
+        agent.start_task(0)
+        agent.end_task()
+        agent.start_task(1)  # from here on what was learned is held, or combined
+        agents.append(agent.to(META))
     group = CapturedGroup(agents, [torch.Generator().manual_seed(seed) for seed in range(3)])
+    for learner in group.learners:
+        learner.optimiser.param_groups[0] |= {"fused": False, "foreach": False}  # unknown on this device
     start, steps = start_of_episodes(env, group.first.initial_state), []
     act, carried = CapturedAct(env, group.policy, start), dict(env.reset().to(META).update(start).items(True, True))
     env.rows.to(META)

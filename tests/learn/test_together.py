@@ -28,7 +28,7 @@ SEEDS = (0, 3, 8)
 
 COMPILED = [("ppo", "scratch"), ("prioritized dqn", "finetune")]
 
-METHODS = ("scratch", "l2", "ewc", "ewc_published", "mask_ri", "mask_lc", "mask_blc")
+METHODS = ("scratch", "l2", "ewc", "ewc_published", "mas", "mask_ri", "mask_lc", "mask_blc")
 
 EACH = [*((name, "finetune") for name in BATCHED), *(("ppo", method) for method in METHODS)]
 
@@ -374,8 +374,8 @@ def test_what_cannot_be_one_batch_says_why(compose):
         return together.why_not_together(new_agent(CURRICULUM, make_agent, 0))
 
     assert reason("lstm_ppo", "finetune") == "LSTMPPO cannot be vectorised over seeds"
-    assert reason("ppo", "packnet") == "PackNet cannot be vectorised over seeds"
-    assert reason("ppo", "mask_amsc") == "MaskAMSC cannot be vectorised over seeds"
+    assert reason("ppo", "packnet") == "PackNet cannot be vectorised over seeds: its hooks take the weights of one seed"
+    assert str(reason("ppo", "mask_amsc")).startswith("MaskAMSC cannot be vectorised over seeds: ")
     assert reason("dqn") is reason("ppo", "mask_lc") is None
     switching = of(Block((ONE, TWO), 96, ByEpisode(2, together=True)), boundaries="hidden")
     assert why_not_together(switching) == "its blocks change the tasks of all rows at once"

@@ -27,7 +27,7 @@ from ctgraph_rl.runs.train import new_agent, with_method
 
 EIGHT = tuple(range(8))
 THREE_SEEDS = (0, 3, 8)
-CURRICULUM = of(Block(ONE, 80), Block(THREE, 32))
+CURRICULUM = of(Block(ONE, 80), Block(THREE, 32), task_id="at_boundaries")
 """Blocks of no whole number of batches, which are of 32 frames."""
 
 CPU = torch.device("cpu")
@@ -47,7 +47,8 @@ def make(compose):
 
     def make(name: str = "ppo", seeds: tuple[int, ...] = THREE_SEEDS, *overrides: str) -> CapturedGroup:
         minibatches = () if name == "a2c" else ONE_EPOCH
-        make_agent = target(compose(f"agent={name}", *TINY, *minibatches, *overrides), "agent")
+        cfg = compose(f"agent={name}", *TINY, *minibatches, *overrides)
+        make_agent = with_method(target(cfg, "agent"), target(cfg, "method"), CURRICULUM)
         generators = []
         agents: list[Any] = []
         for seed in seeds:
@@ -122,11 +123,31 @@ def test_what_changes_an_agent_at_the_start_of_a_task_changes_what_acts(make):
     assert (group.stack.kept[group.stack.weights[1]][1] == 0.5).all()
 
 
+def test_what_a_method_draws_at_a_boundary_follows_from_the_counter_of_its_seed(make):
+    group = make("a2c", THREE_SEEDS, "method=mask_ri")
+    other = make("a2c", THREE_SEEDS, "method=mask_ri")
+    other.generators[0].manual_seed(99)
+
+    for each in (group, other):
+        each.start_task(0)
+        each.start_task(1)
+
+    assert torch.equal(group.methods[0].own[0], other.methods[0].own[0])
+    assert len({method.own[0][0].item() for method in group.methods}) == 3
+
+
 @pytest.mark.parametrize(
     ("name", "overrides"),
     others_slow(
-        [("ppo", ()), ("a2c", ()), ("a2c", ("agent.normalize_advantage=true",)), ("lstm_ppo", ())],
-        ("a2c", ("agent.normalize_advantage=true",)),
+        [
+            ("ppo", ()),
+            ("a2c", ()),
+            ("a2c", ("agent.normalize_advantage=true", "method=ewc")),
+            ("lstm_ppo", ()),
+            *(("ppo", (f"method={method}",)) for method in ("scratch", "l2", "ewc", "mas", "mask_ri")),
+            ("lstm_ppo", ("method=mask_lc",)),
+        ],
+        ("a2c", ("agent.normalize_advantage=true", "method=ewc")),
     ),
 )
 def test_eight_seeds_learn_from_what_each_would_alone_with_its_losses_and_gradients(name, overrides, make, monkeypatch):
@@ -140,13 +161,13 @@ def test_eight_seeds_learn_from_what_each_would_alone_with_its_losses_and_gradie
         for number, agent in enumerate(group.agents):
             alone = agent.loss({key: value[number] for key, value in minibatch.items()})
             torch.testing.assert_close({key: value[number] for key, value in losses.items()}, alone)
-            [expected] = torch.autograd.grad(total_loss(alone), agent.weights[:1])
+            [expected] = torch.autograd.grad(total_loss(alone), group.learners[number].weights[:1])
             torch.testing.assert_close(gradient[number].mT if expected.ndim == 2 else gradient[number], expected)
         compared.append(gradient)
 
     def learned(batch):
         items = group._items(batch)
-        for number, (agent, part) in enumerate(zip(group.agents, batch.chunk(8), strict=True)):
+        for number, (agent, part) in enumerate(zip(group.learners, batch.chunk(8), strict=True)):
             expected = agent._with_advantage(part)
             for key, value in expected.items():
                 value = value if agent.memory else value.flatten(0, 1)
@@ -163,12 +184,12 @@ def test_eight_seeds_learn_from_what_each_would_alone_with_its_losses_and_gradie
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["ppo", "lstm_ppo"])
-def test_memory_of_graphs_changes_no_bit_of_seeds(name, make, captured, monkeypatch):
-    group = make(name)
+@pytest.mark.parametrize(("name", "method"), [("ppo", "finetune"), ("lstm_ppo", "finetune"), ("ppo", "mask_lc")])
+def test_memory_of_graphs_changes_no_bit_of_seeds(name, method, make, captured, monkeypatch):
+    group = make(name, THREE_SEEDS, f"method={method}")
     logs = learn(group)
     monkeypatch.undo()
-    other = make(name)
+    other = make(name, THREE_SEEDS, f"method={method}")
     monkeypatch.setattr(other, "gradient_step", other._usual_update)
 
     other_logs = learn(other)
@@ -178,9 +199,10 @@ def test_memory_of_graphs_changes_no_bit_of_seeds(name, make, captured, monkeypa
 
 
 @pytest.mark.slow
-def test_another_seed_beside_it_changes_no_bit_of_a_seed(make, captured):
-    group = make("ppo", (0, 3, 8))
-    other = make("ppo", (0, 5, 8))
+@pytest.mark.parametrize("method", ["finetune", "mask_ri"])
+def test_another_seed_beside_it_changes_no_bit_of_a_seed(method, make, captured):
+    group = make("ppo", (0, 3, 8), f"method={method}")
+    other = make("ppo", (0, 5, 8), f"method={method}")
 
     logs = learn(group, (0, 3, 8))
     other_logs = learn(other, (0, 5, 8))
@@ -191,14 +213,20 @@ def test_another_seed_beside_it_changes_no_bit_of_a_seed(make, captured):
     assert not equal(states(group)[1], states(other)[1])
 
 
-@pytest.mark.parametrize("name", ["a2c", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ppo", "lstm_ppo"))])
-def test_seeds_are_resumed_from_any_state_as_if_they_had_never_stopped(name, make, captured, tmp_path):
+@pytest.mark.parametrize(
+    ("name", "method"),
+    others_slow(
+        [("a2c", "finetune"), ("ppo", "finetune"), ("lstm_ppo", "finetune"), ("ppo", "mask_ri"), ("a2c", "ewc")],
+        ("a2c", "finetune"),
+    ),
+)
+def test_seeds_are_resumed_from_any_state_as_if_they_had_never_stopped(name, method, make, captured, tmp_path):
     def new_logs(folder: str) -> list[RunLog]:
         (tmp_path / folder).mkdir()
         return [RunLog(tmp_path / folder / f"{seed}.jsonl") for seed in THREE_SEEDS]
 
     kept: list[Any] = []
-    group = make(name)
+    group = make(name, THREE_SEEDS, f"method={method}")
     logs = new_logs("whole")
     learn_together(
         CURRICULUM,
@@ -213,7 +241,7 @@ def test_seeds_are_resumed_from_any_state_as_if_they_had_never_stopped(name, mak
             (tmp_path / f"{seed}.jsonl").write_bytes((tmp_path / "whole" / f"{seed}.jsonl").read_bytes())
         pairs = zip(THREE_SEEDS, kept[place], strict=True)
         resumed_logs = [RunLog.resume(tmp_path / f"{seed}.jsonl", state["log"]) for seed, state in pairs]
-        resumed = make(name)
+        resumed = make(name, THREE_SEEDS, f"method={method}")
         learn_together(CURRICULUM, resumed, THREE_SEEDS, resumed_logs, saved=kept[place])
         assert equal(states(resumed), states(group))
         assert list(map(lines, resumed_logs)) == list(map(lines, logs))
@@ -256,10 +284,10 @@ def test_what_cannot_be_captured_for_all_seeds_says_why(compose):
         return why_agents_learn_alone(agent, GPU)
 
     assert reason("dqn") == "DQN cannot be vectorised over seeds on a GPU"
-    assert reason("ppo", "ewc") == "EWC cannot be vectorised over seeds on a GPU"
+    assert reason("ppo", "si") == "SI cannot be vectorised over seeds: its hooks take the weights of one seed"
     assert reason("ppo_count") == "PPOCount does not learn by the steps that a batch of seeds shares"
     assert reason("ppo", amsgrad=True) == "Adam with these settings cannot be vectorised over seeds"
-    assert reason("lstm_ppo") is None
+    assert reason("lstm_ppo") is reason("ppo", "ewc") is None
 
 
 @pytest.mark.slow
