@@ -45,7 +45,7 @@ ELSEWHERE = {
 
 LONG = (
     *("docs/how-to/collectives.md", "docs/how-to/go_fast.md", "docs/how-to/sb3_and_gymnasium.md"),
-    *("docs/how-to/torchrl_ppo.md", "docs/how-to/train_in_python.md"),
+    *("docs/how-to/recorder.md", "docs/how-to/torchrl_ppo.md", "docs/how-to/train_in_python.md"),
 )
 """Pages whose Python takes over a second: it is compiled, and runs with the slow tests."""
 

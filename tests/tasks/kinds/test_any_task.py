@@ -25,7 +25,7 @@ from ctgraph_rl.report.bounds_of_runs import bounds_of_curriculum
 from ctgraph_rl.tasks.kinds.gym_task import GymTask
 from ctgraph_rl.tasks.switch import Drift
 
-PAGE = CHECKOUT / "docs" / "how-to" / "other_environments.md"
+PAGE = CHECKOUT / "docs" / "reference" / "own_env_base.md"
 TINY = ("agent.num_envs=8", "agent.num_steps=8", "agent.hidden_size=8", "agent.num_epochs=1")
 LAKES = ("curriculum=frozen_lake_4maps", "curriculum.num_frames=128", "evaluation.num_episodes=4", *TINY)
 
