@@ -122,3 +122,22 @@ def test_a_log_is_a_data_frame_where_pandas_is_there(log, monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ModuleNotFoundError, match="pip install pandas"):
         log.to_pandas()
+
+
+@pytest.mark.parametrize(("kind", "columns"), [("evaluation", EVALUATIONS), ("training", TRAINING)])
+def test_a_data_frame_of_a_run_has_the_columns_of_its_tables_with_their_types_and_values(kind, columns):
+    pandas = pytest.importorskip("pandas")
+    run = RunLog()
+    run.append("run", curriculum="mine", fingerprint="00ff", config={"seed": 3}, trained=[[1]])
+    learn_curriculum(curriculum(Block(task(), 48)), Scripted(), log=run)
+
+    frame = run.to_pandas(kind)
+
+    kinds = {"string": "OSU", "bool": "b", "int64": "i", "double": "f"}
+    rows = list(run.rows(kind))
+    assert isinstance(frame, pandas.DataFrame) and len(frame) == len(rows) > 1
+    assert list(frame.columns) == list(rows[0])
+    for name, (type_name, _) in columns.items():
+        found = frame[name].astype(object).where(frame[name].notna(), None)
+        assert frame[name].dtype.kind in kinds[type_name], name
+        assert found.tolist() == [row[name] for row in rows], name
