@@ -35,26 +35,34 @@ def draw_similarity(curriculum: Curriculum, path: Path | str) -> None:
     figure.suptitle(f"{figure_text(curriculum.name)}: similarity of {len(tasks)} tasks")
     *panels, last = figure.subplots(2, 3).flat
     for axes, (title, measure) in zip(panels, MEASURES.items(), strict=True):
-        image = _draw_matrix(axes, measure(tasks), curriculum.labels, title)
+        image = _draw_matrix(axes, measure(tasks), title)
+        _draw_labels(axes, curriculum.labels, is_lowest=axes in panels[2:], is_leftmost=axes in panels[::3])
     last.axis("off")
     figure.colorbar(image, ax=last, location="left", shrink=0.8, label="share; hatched: nothing to compare")
     save_figure(figure, path)
 
 
-def _draw_matrix(axes: Any, matrix: Tensor, labels: Sequence[str], title: str) -> Any:
+def _draw_matrix(axes: Any, matrix: Tensor, title: str) -> Any:
     axes.set_facecolor("white")
     axes.patch.set(hatch="////", edgecolor="grey")
     image = axes.imshow(matrix.numpy(), cmap="Greys", vmin=0, vmax=1)
     axes.set_title(title, fontsize=9)
-    if len(labels) > MOST_LABELS:
-        axes.set(xlabel="task, from 0", ylabel="task, from 0")
-        return image
-    size = max(4, 8 - len(labels) // 8)
-    axes.set_xticks(range(len(labels)), labels, rotation=90, fontsize=size)
-    axes.set_yticks(range(len(labels)), labels, fontsize=size)
-    if len(labels) <= MOST_NUMBERS:
+    if len(matrix) <= MOST_NUMBERS:
         for (i, j), value in np.ndenumerate(matrix.numpy()):
             ink = "white" if value > 0.6 else "black"
             if not np.isnan(value):
-                axes.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color=ink)
+                number = axes.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color=ink)
+                number.set_in_layout(False)  # it is within the panel
     return image
+
+
+def _draw_labels(axes: Any, labels: Sequence[str], is_lowest: bool, is_leftmost: bool) -> None:
+    """Name the tasks where no panel below, or to the left, names them: labels take most of the time of a figure."""
+    if len(labels) > MOST_LABELS:
+        axes.set(xlabel="task, from 0", ylabel="task, from 0")
+        return
+    size = max(4, 8 - len(labels) // 8)
+    columns = labels if is_lowest else ()
+    rows = labels if is_leftmost else ()
+    axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=size)
+    axes.set_yticks(range(len(rows)), rows, fontsize=size)

@@ -11,12 +11,14 @@ import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import pytest
 import torch
 
+import ctgraph_rl
 from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, Task, metrics
 from ctgraph_rl.describe import describe
 from ctgraph_rl.learn.refusals import check_rows
@@ -26,6 +28,8 @@ from ctgraph_rl.log.tables import write_tables
 from ctgraph_rl.metrics import Regime
 from ctgraph_rl.metrics.lifetime import theil_sen
 from ctgraph_rl.tasks.configurations import ct_su_b1
+
+SOURCE = str(Path(ctgraph_rl.__file__).parent)
 
 
 def tasks(count: int, depth: int = 6) -> list[Task]:
@@ -66,7 +70,7 @@ def counted() -> Iterator[list[int]]:
     count = [0]
 
     def trace(frame: FrameType, event: str, _: Any) -> Any:
-        if "ctgraph_rl" not in frame.f_code.co_filename:
+        if not frame.f_code.co_filename.startswith(SOURCE):
             return None
         count[0] += event in ("call", "line")
         return trace

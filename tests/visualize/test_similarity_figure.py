@@ -8,6 +8,7 @@ from helpers.oracles import surjective
 import curricula
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Block
+from ctgraph_rl.visualize import similarity_figure
 from ctgraph_rl.visualize.similarity_figure import draw_similarity
 
 GOALS = [(1, 1), (1, 2), (2, 2)]
@@ -20,6 +21,17 @@ def test_the_heat_maps_are_drawn_for_few_and_many_tasks(tmp_path, num_tasks):
     draw_similarity(Curriculum("c", 1, "", blocks), tmp_path / "map.png")
 
     assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_tasks_are_named_left_of_each_row_and_below_each_column_of_maps(monkeypatch):
+    drawn = []
+    monkeypatch.setattr(similarity_figure, "save_figure", lambda figure, path: drawn.append(figure))
+
+    draw_similarity(curricula.load("su_b1_4tasks"), "map.png")
+
+    maps = drawn[0].axes[:5]
+    assert [len(axes.get_yticklabels()) for axes in maps] == [4, 0, 0, 4, 0]
+    assert [len(axes.get_xticklabels()) for axes in maps] == [0, 0, 4, 4, 4]
 
 
 def test_without_matplotlib_the_extra_is_named(tmp_path, monkeypatch):
