@@ -179,6 +179,7 @@ def test_eight_seeds_learn_from_what_each_would_alone_with_its_losses_and_gradie
     monkeypatch.setattr(group, "learn", learned)
     learn(group, EIGHT)
 
+    assert all(method.samples.remaining == 0 for method in group.methods if hasattr(method, "samples"))
     assert len(compared) == 4
     assert all(gradient.abs().max() > 0 for gradient in compared)
 
