@@ -25,8 +25,8 @@ PAGES = {
 }
 """Pages, and the modules that make them."""
 
-APART = {"statistics": "studies.coverage", "together": "studies.together"}
-"""What is made only by its name: the page of intervals, and the table of docs/how-to/seeds_together.md (printed)."""
+APART = {"statistics": "studies.coverage"}
+"""What is made only by its name: the page of intervals."""
 
 OF_AGENTS = ("main_job", "baselines_b1", "baselines_fo_b2", "depth_ladder")
 OF_METHODS = ("masks_ct8_md", "masks_ct8", "masks_ct12", "methods")

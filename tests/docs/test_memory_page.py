@@ -167,8 +167,6 @@ def test_what_the_page_says_in_words_of_the_hardest_graphs_holds(names):
     assert "With first rewards given it holds for some rivals only" in PAGE
     assert number(unique["PPO (no memory)"]) >= 3
     assert "which the claim does not name, solves the graph with unique decisions, too" in PAGE
-    given, found = (f"{number(of['MOHQA'])} of 5" for of in (unique, unique_to_find))
-    assert f"solves the graph with unique decisions in: {given} (first rewards given), {found} (to be found)" in PAGE
 
 
 def test_the_steps_of_batches_of_reinforce_and_a2c_are_compared_by_counts_of_seeds(names):
@@ -197,9 +195,6 @@ def test_the_steps_of_batches_of_reinforce_and_a2c_are_compared_by_counts_of_see
         assert f"p = {wait_prob} in {half[0]} of 5" in PAGE
     of_half = [f"{number(of_100['0.5', 'True', '100', '204800', key])} of 5" for key in keys]
     assert f"p = 0.5 in {of_half[0]} and {of_half[1]}." in PAGE
-    of_a2c = count["A2C (8 steps)"], count["A2C (32 steps)"]
-    assert "unique decisions in {} seeds with batches of 8 steps and in {} with 32.".format(*of_a2c) in PAGE
-    assert abs(number(unique["A2C (8 steps)"]) - number(unique["A2C (32 steps)"])) <= 1
 
 
 @pytest.mark.parametrize("steps", [8, 32, 128])
@@ -213,7 +208,7 @@ def test_the_share_of_frames_whose_episode_a_batch_cuts_off_is_that_of_simulated
         ages = edges - ends[ends.searchsorted(edges, side="right") - 1]
         shares.append(100 * np.minimum(ages, steps).mean() / steps)
 
-    part = PAGE.split("cuts off is ")[1].split("So REINFORCE")[0]
+    part = PAGE.split("cuts off, at p = 0, 0.5 and 0.9, is ")[1].split("So REINFORCE")[0]
     said = re.search(rf"([\d, %and]+) with {steps}\b", part)[1]
 
     assert [float(each) for each in re.findall(r"\d+(?= %)", said)] == pytest.approx(shares, abs=0.7)

@@ -64,8 +64,8 @@ METHODS = {
 }
 """The beginning of the names of runs, and what is submitted of them."""
 
-ELSEWHERE = ("average performance", "bytes of the agent", "steps")
-"""Columns that stand on the board itself alone, for want of room."""
+ELSEWHERE = ("average performance", "bytes of the agent", "steps", "n", "level")
+"""Columns that only the board itself has: the page names seeds and levels once."""
 
 TUNING = "the settings of the package; strengths of methods were chosen for PPO, on seeds that were not recorded"
 

@@ -141,13 +141,11 @@ def section(report: Mapping[str, Any] | None) -> str:
     about, tests = report["machine"], report.get("tests", {"said": "not run"})
     text = f"Measured on {about['device']}, driver {about['driver']}, commit {report['commit']}.\n"
     text += f"Tests marked `cuda`: {tests['said']}.\n"
-    environment = report.get("environment", [])
-    fewest = min((row["rows"] for row in environment), default=0)
-    shown = [row for row in environment if row["rows"] == fewest]
+    fewest = min((row["rows"] for row in report.get("environment", [])), default=0)
     learned = ladder.table(report.get("learning", []), learning.ENVIRONMENT).splitlines()
     small = tuple(f"| {row['rows']:,} |" for row in report.get("learning", []) if row["rows"] < fewest)
     large = [line for line in learned if "seeds" in line or not line.startswith(small)]
-    text += "\n".join(["", ladder.table(shown, ladder.COPY), "", *large, ""])
+    text += "\n".join(["", *large, ""])
     return text + "".join(f"\n{line}\n" for line in jobs(report.get("learning", [])))
 
 

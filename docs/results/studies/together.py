@@ -9,11 +9,11 @@ from statistics import NormalDist, fmean
 from typing import Any
 
 from ctgraph_rl.report import statistics
-from studies.raw import groups, machine_of, read, table, write
+from studies.raw import groups, machine_of, read, write
 
 NAME = "together_fo_b1"
 WAYS = ("alone", "together")
-MEASURES = {"frames_to_90": "frames to 90 % of the final return", "final_return": "final return"}
+MEASURES = ("frames_to_90", "final_return")
 WINDOW = 5
 """Batches over which the mean return of training is taken."""
 
@@ -73,20 +73,3 @@ def detectable(comparison: statistics.Comparison, num_seeds: int) -> float:
     """Return the difference of means that a paired t-test at 5 % finds with `POWER`, normally approximated."""
     normal = NormalDist()
     return (normal.inv_cdf(0.975) + normal.inv_cdf(POWER)) * (comparison.std or 0.0) / math.sqrt(num_seeds)
-
-
-def page_table() -> str:
-    """Return a line for each agent and measure: means both ways, equal seeds, the p-value, and what would be found."""
-    found, rows = comparisons(), []
-    for (agent, measure), (comparison, alone, together) in found.items():
-        digits = 0 if measure == "frames_to_90" else 3
-        values = fmean(alone), fmean(together), detectable(comparison, len(alone))
-        first, second, least = (f"{value:,.{digits}f}" for value in values)
-        p_value = f"{comparison.p_value:.2f}"
-        rows.append([f"`{agent}`", MEASURES[measure], first, second, str(comparison.ties), p_value, least])
-    return table(["agent", "measure", "single runs", "together", "equal seeds", "p", "found with power 0.9"], rows)
-
-
-def make() -> None:
-    """Print the table of the page."""
-    print(page_table())

@@ -75,19 +75,10 @@ def forward_transfer(runs: np.ndarray, experts: np.ndarray) -> np.ndarray:
         return np.nan_to_num((runs - experts) / (1 - experts), nan=-np.inf, neginf=-np.inf).mean(-1)
 
 
-def gain(runs: np.ndarray, experts: np.ndarray) -> np.ndarray:
-    """Mean over tasks of what areas [..., tasks] gain over the experts'."""
-    return (runs - experts).mean(-1)
-
-
-def transfer(runs: np.ndarray, experts: np.ndarray, left_out: Sequence[int]) -> dict[str, str]:
-    """Forward transfer and gain over the experts, with the uncertainty of both sides."""
+def transfer(runs: np.ndarray, experts: np.ndarray, left_out: Sequence[int]) -> str:
+    """Forward transfer, with the uncertainty of both sides."""
     kept = [task for task in range(runs.shape[1]) if task + 1 not in left_out]
-    forward = statistics.of_two_groups(runs[:, kept], experts[:, kept], forward_transfer, RETURNS)
-    return {
-        "forward transfer": shown(forward),
-        "gain over experts": shown(statistics.of_two_groups(runs, experts, gain, RETURNS)),
-    }
+    return shown(statistics.of_two_groups(runs[:, kept], experts[:, kept], forward_transfer, RETURNS))
 
 
 OF_A_RUN = {
@@ -102,7 +93,6 @@ OF_A_RUN = {
 COLUMNS = (
     "average performance",
     "forward transfer",
-    "gain over experts",
     "forgetting",
     "TPOT",
     "tasks learned",
@@ -120,7 +110,7 @@ def summary(name: str) -> str:
     for method in dict.fromkeys(expected(name)["method"]):
         runs = [lines for (who, _), lines in of.items() if who == method]
         found, own = [scores(lines) for lines in runs], areas(runs)
-        values = transfer(own, alone, left_out)
+        values = {"forward transfer": transfer(own, alone, left_out)}
         values |= {column: mean_of([each[column] for each in found], bounds(column, runs[0])) for column in OF_A_RUN}
         rows.append([f"`{method}`", str(len(found)), *(values[column] for column in COLUMNS)])
     tasks = f"task {', '.join(map(str, left_out))}" if left_out else "none"

@@ -29,7 +29,6 @@ class Table:
         found = {(method, int(seed)): comparison.curves(lines) for (method, seed), lines in sorted(of.items())}
         self.curves = {who: [run for (other, _), run in found.items() if other == who] for who, _ in found}
         self.experts = torch.stack([run.performance for run in self.curves["expert"]])
-        self.alone = self.experts.mean((0, 1))
         self.goals = GOALS[name]
 
     def ends(self, method: str) -> torch.Tensor:
@@ -46,16 +45,12 @@ class Table:
 
     def stages(self, method: str) -> torch.Tensor:
         """float64 [seeds, tasks, evaluations]: each task in its own block."""
-        tasks = range(len(self.alone))
+        tasks = range(len(self.goals))
         return torch.stack([torch.stack([run.own_stage(task) for task in tasks]) for run in self.curves[method]])
 
     def areas(self, method: str) -> torch.Tensor:
         """float64 [seeds, tasks]: mean return over a task's own block."""
         return self.stages(method).mean(-1)
-
-    def gain(self, method: str) -> torch.Tensor:
-        """float64 [seeds, tasks]: over the experts' mean."""
-        return self.areas(method) - self.alone
 
     def names(self, mastered: torch.Tensor) -> list[set[str]]:
         """The goals that are mastered, for each seed."""

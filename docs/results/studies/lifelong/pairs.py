@@ -102,12 +102,12 @@ def rows(found: Mapping[str, Comparison]) -> str:
     """A line for each comparison, its p-value corrected for all of them."""
     corrected = statistics.holm([each.p_value for each in found.values()])
     lines = [_row(name, each, p) for (name, each), p in zip(found.items(), corrected, strict=True)]
-    return table(["", "difference", "pairs", "better, equal, worse", "p (Holm)"], lines)
+    return table(["", "difference", "better, equal, worse", "p (Holm)"], lines)
 
 
 def _row(name: str, each: Comparison, corrected: float | None) -> list[str]:
     record = ", ".join(map(str, (each.wins, each.ties, each.losses)))
-    return [name, shown(each.difference), str(each.difference.n), record, _p(corrected)]
+    return [name, shown(each.difference), record, _p(corrected)]
 
 
 def _p(value: float | None) -> str:

@@ -16,8 +16,6 @@ from studies.memory.runs import AGENTS, SETTINGS, count, measured, ranking
 from studies.raw import HERE, TEMPLATES, Raw, grow, lost, machines, merged
 
 LENGTHS = {
-    "a2c_short": "a2c, 8 steps",
-    "a2c_long": "a2c, 32 steps",
     "reinforce_short": "reinforce, 8 steps",
     "reinforce_long": "reinforce, 128 steps",
 }
@@ -65,8 +63,6 @@ def texts() -> dict[str, str]:
     of = finished()
     ranked = {"shared": SHARED, "find_shared": TO_FIND[0], "find_unique": TO_FIND[1]}
     found = {place: ranking(of.get(condition, {})) for place, condition in ranked.items()}
-    for place, condition in (("unique", UNIQUE), ("find_unique", TO_FIND[1])):
-        found[f"mohqa_{place}"] = count(of[condition].get("mohqa"))
     found |= {f"cut_{steps}": graphs.cut_off(steps) for steps in (8, 32, 128)}
     for wait_prob, middle in (("0.9", ""), ("0.5", "_half")):
         for images, end in (("500", ""), ("100", "_100")):
