@@ -11,12 +11,8 @@ import torch
 from helpers.paths import CHECKOUT
 from helpers.sweeping import command_line
 
-import curricula
-from baselines.methods.ewc import EWC
-from baselines.methods.mask_lc import MaskLC
-from ctgraph_rl import CTGraph, CTGraphEnv, Observations, PaperImages, Protocol, Task, metrics
+from ctgraph_rl import CTGraph, CTGraphEnv, Observations, PaperImages, Task, metrics
 from ctgraph_rl.core.device import checked_device
-from ctgraph_rl.gym import CTGraphGymEnv
 from ctgraph_rl.log.scores import NO_EXPERTS
 from ctgraph_rl.tasks.configurations import ct_fo_b1, ct_su_b1
 
@@ -37,24 +33,6 @@ OF_RUNS = (
 GRAPH, SMALL = CTGraph(2, 2), {"wait_ids": (2, 2), "decision_ids": (3, 3)}
 
 
-def act(*actions: int) -> None:
-    env = CTGraphEnv([ct_su_b1()])
-    data = env.reset()
-    for action in actions:
-        data = env.step(data.set("action", torch.tensor([action])))["next"]
-
-
-def act_after_the_end() -> None:
-    env = CTGraphGymEnv(ct_su_b1())
-    env.reset(seed=0)
-    for action in (0, 1, 0):
-        env.step(action)
-
-
-def prepared(method: object, **protocol: str) -> None:
-    method.prepare(replace(curricula.load("su_b1_4tasks"), protocol=Protocol(**protocol)))
-
-
 RAISED: list[Callable[[], object]] = [
     lambda: CTGraph(2, 2, 1.0),
     lambda: replace(ct_su_b1(), goal=(1, 3)),
@@ -62,13 +40,8 @@ RAISED: list[Callable[[], object]] = [
     lambda: Task(GRAPH, (1, 2), Observations(**SMALL, end_ids=(4, 7), unique_waits=True), PaperImages(40)),
     lambda: Task(GRAPH, (1, 2), Observations((3, 102), (2, 2), (103, 103)), PaperImages(40)),
     lambda: replace(ct_su_b1(), step_reward=-0.01).memoryless_ceiling(),
-    lambda: act(7),
-    lambda: act(0, 1, 0),
-    act_after_the_end,
     lambda: CTGraphEnv([ct_su_b1()]).set_tasks([ct_fo_b1()]),
     lambda: checked_device("cuda"),
-    lambda: prepared(MaskLC()),
-    lambda: prepared(EWC(1.0, False, 0.5, "policy", num_samples=1024, heads="auto"), boundaries="hidden"),
 ]
 
 TYPED = (
