@@ -15,11 +15,11 @@ Weights from modulatory neurons stay. A gene g gives w = 10 g^3; a weight below 
 g^3 or 0 below 0.01, and r = 100 g^3. A life begins with these weights.
 
 After a generation the population is cut into segments at a random place. The best of a segment has all its children:
-clones or crossed with a random individual, then with a neuron more or less, then with all genes mutated by +-exp(-180
-|u|), u uniform in [-1, 1]. A new neuron is standard or modulatory with equal probability, and its genes are 0 before
-that. Individuals before the first segment have a child each. The best one of all stays unchanged and is individual 0.
-The first generation's genes of weights are mutated zeros, with 10 in place of 180, those of the rule uniform. The
-autoencoder learns from what the population saw.
+clones or crossed with a random individual. Then a neuron can be inserted, then one duplicated, then one deleted: three
+independent draws. Then all genes are mutated by +-exp(-180 |u|), u uniform in [-1, 1]. A new neuron is standard or
+modulatory with equal probability, and its genes are 0 before that. Individuals before the first segment have a child
+each. The best one of all stays unchanged and is individual 0. The first generation's genes of weights are mutated
+zeros, with 10 in place of 180, those of the rule uniform. The autoencoder learns from what the population saw.
 
 A greedy evaluation plays the best individual, which is the result of evolution; the mean of the population has mutants
 that are of no use, and training measures it. An evaluation that samples plays the population in turns.
@@ -157,21 +157,12 @@ class Reproduction(NamedTuple):
         )
 
     def resized(self, population: Population) -> Population:
-        """Insert, duplicate or delete a neuron of some individuals; the first neuron stays."""
-        size = population.size
-        new = population.modulates.shape[1]
-        lost = (1 + torch.rand_like(population.rule[:, 0]) * (size - 1)).long().minimum(size - 1)
-        model = (torch.rand_like(population.rule[:, 0]) * size).long().minimum(size - 1)
-        chance = chances(population)
-        inserts = chance < self.insert_prob
-        grows = chance < self.insert_prob + self.duplicate_prob
-        shrinks = ~grows & (chance < self.insert_prob + self.duplicate_prob + self.delete_prob) & (size > 1)
-        source = torch.arange(new + 1, device=size.device).repeat(len(size), 1)
-        place = torch.where(grows, size, lost).unsqueeze(-1)
-        copied = torch.where(shrinks, size - 1, torch.where(inserts, new, model)).unsqueeze(-1)
-        source = torch.where((grows | shrinks).unsqueeze(-1), source.scatter(1, place, copied), source)
-        size = size + grows.long() - shrinks.long()
-        return rearranged(population, source[:, : int(size.max())], size)
+        """Insert, then duplicate, then delete a neuron, each of some individuals; the first neuron stays."""
+        blank = torch.full_like(population.size, population.modulates.shape[1])
+        population = grown(population, chances(population) < self.insert_prob, blank)
+        population = grown(population, chances(population) < self.duplicate_prob, below(population.size))
+        deletes = (chances(population) < self.delete_prob) & (population.size > 1)
+        return shrunk(population, deletes, 1 + below(population.size - 1))
 
 
 def chances(population: Population) -> Tensor:
@@ -179,6 +170,35 @@ def chances(population: Population) -> Tensor:
     drawn = torch.rand_like(population.rule[:, 0])
     drawn[0] = 1
     return drawn
+
+
+def below(count: Tensor) -> Tensor:
+    """Draw an integer of each range from 0 on, int64 like ``count``."""
+    drawn = torch.rand(count.shape, dtype=torch.float32, device=count.device)
+    return (drawn * count).long().minimum(count - 1)
+
+
+def grown(population: Population, who: Tensor, model: Tensor) -> Population:
+    """Give some individuals a neuron more.
+
+    Args:
+        population: of up to n neurons.
+        who: which individuals, bool [individuals].
+        model: the neuron that is copied, but for the gene to itself; n: a new one, int64 [individuals].
+    """
+    place = torch.arange(population.modulates.shape[1] + 1, device=who.device)
+    added = who.unsqueeze(-1) & (place == population.size.unsqueeze(-1))
+    found = rearranged(population, torch.where(added, model.unsqueeze(-1), place), population.size + who.long())
+    itself = pad(added.unsqueeze(1) & added.unsqueeze(2), (0, 0, population.num_inputs, 0))
+    return found._replace(genes=found.genes.masked_fill(itself, 0))
+
+
+def shrunk(population: Population, who: Tensor, lost: Tensor) -> Population:
+    """Delete a neuron, int64 [individuals], of some individuals, bool [individuals]; later ones move up."""
+    size = population.size - who.long()
+    place = torch.arange(int(size.max()), device=who.device)
+    moves = who.unsqueeze(-1) & (place >= lost.unsqueeze(-1))
+    return rearranged(population, place + moves.long(), size)
 
 
 def rearranged(population: Population, source: Tensor, size: Tensor) -> Population:

@@ -22,6 +22,7 @@ DATA = Path(__file__).resolve().parents[1] / "data"
 TINY = ["agent.num_envs=8", "agent.num_steps=4", "agent.hidden_size=4"]
 REPLAY = ["agent.num_updates=1", "agent.batch_size=4", "agent.buffer_size=64", "agent.target_update_interval=2"]
 MINIBATCHES = ["agent.num_minibatches=2", "agent.num_epochs=1"]
+GENERATIONS = ["agent.num_batches=1", "agent.num_trials=1", "agent.num_updates=1", "agent.insert_prob=0.5"]
 METHODS = {
     "clear": ["method.buffer_size=48"],
     "mask_sc": ["method.num_samples=4", "method.every=1", "method.threshold=-1"],
@@ -68,6 +69,7 @@ def _builders(group: str) -> dict[str, Any]:
                     *TINY,
                     *REPLAY * ("target_update_interval" in cfg.agent),
                     *MINIBATCHES * ("num_minibatches" in cfg.agent),
+                    *GENERATIONS * ("insert_prob" in cfg.agent),
                 ]
             made[path.stem] = config.target(hydra.compose("config", overrides=[f"{group}={path.stem}", *small]), group)
     return made

@@ -24,9 +24,9 @@ from baselines.penn_a import (
     Population,
     Reproduction,
     first_population,
+    grown,
     live,
     mutation,
-    rearranged,
     winners,
 )
 from ctgraph_rl import Block, CTGraph, CTGraphEnv, Curriculum, Evaluation, Protocol, Task, evaluate, learn_curriculum
@@ -201,21 +201,50 @@ def test_a_neuron_is_inserted_duplicated_or_deleted_and_the_others_keep_their_ge
     for old, new, size in zip(parents.genes[1:], children.genes[1:], children.size[1:].tolist(), strict=True):
         diagonal = [new[3 + k, k].item() for k in range(size)]  # a neuron's gene to itself: all differ
         others = [old[3 + k, k].item() for k in range(size - sizes)]
-        assert len({*diagonal} & {*others}) == min(size, size - sizes)
-        assert len({*diagonal}) == size - (change == "duplicate")
+        kept = [gene for gene in others if gene in diagonal]
+        assert diagonal == (kept if change == "delete" else [*others, 0])
+        assert len(kept) == min(size, size - sizes)
         assert diagonal[0] == others[0]
         known = size - (change == "insert")  # the genes of a new neuron are 0
-        assert new[: 3 + known, :known].count_nonzero() == (3 + known) * known
-        assert new.count_nonzero() == (3 + known) * known
+        assert new[: 3 + known, :known].count_nonzero() == (3 + known) * known - (change == "duplicate")
+        assert new.count_nonzero() == (3 + known) * known - (change == "duplicate")
+
+
+def test_insertion_duplication_and_deletion_are_independent_draws_and_come_in_this_order():
+    """A population of one neuron: only what came before can be copied or lost, but not the first one."""
+    torch.manual_seed(0)
+    count = 20_001
+    genes = torch.full((count, 4, 1), 0.5)
+    parents = Population(genes, torch.zeros(count, 5), torch.zeros(count, 1).bool(), torch.ones(count).long())
+    i, d, x = 0.3, 0.4, 0.6
+
+    children = NOTHING._replace(insert_prob=i, duplicate_prob=d, delete_prob=x).resized(parents)
+
+    def share(chosen) -> float:
+        return chosen[1:].double().mean().item()
+
+    copies_first = (children.genes[:, 0, 1:] != 0).any(dim=1)  # 0 in a new neuron and in copies of one
+    expected = {
+        1: (1 - i) * (1 - d) + x * (i * (1 - d) + (1 - i) * d),
+        2: (1 - x) * (i * (1 - d) + (1 - i) * d) + x * i * d,
+        3: (1 - x) * i * d,
+    }
+    for size, chance in expected.items():
+        assert abs(share(children.size == size) - chance) < 4 * math.sqrt(chance * (1 - chance) / count), size
+    chance = (1 - i) * d * (1 - x) + i * d / 2 * (1 - x / 2)
+    assert abs(share(copies_first) - chance) < 4 * math.sqrt(chance * (1 - chance) / count)
+    assert children.size[0] == 1
 
 
 def test_rows_and_columns_of_a_copied_neuron_are_those_of_its_model():
     parents = some_population(count=1, neurons=2)
 
-    copy = rearranged(parents, torch.tensor([[0, 1, 1]]), torch.tensor([3]))
+    copy = grown(parents, torch.tensor([True]), torch.tensor([1]))
 
-    assert torch.equal(copy.genes[0, :, 1], copy.genes[0, :, 2])
-    assert torch.equal(copy.genes[0, 4], copy.genes[0, 5])
+    assert copy.genes[0, 4, 2] == copy.genes[0, 5, 1] == parents.genes[0, 4, 1]
+    assert copy.genes[0, 5, 2] == 0  # of the copy to itself
+    assert torch.equal(copy.genes[0, :5, 1], copy.genes[0, :5, 2])
+    assert torch.equal(copy.genes[0, 4, :2], copy.genes[0, 5, :2])
     assert torch.equal(copy.genes[0, :5, :2], parents.genes[0])
     assert copy.modulates[0].tolist() == parents.modulates[0, [0, 1, 1]].tolist()
 
