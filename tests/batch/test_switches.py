@@ -366,8 +366,8 @@ def test_what_the_rotation_turns_in_from_outside_is_black_after_the_noise_and_no
 def test_noise_before_the_rotation_is_uniform_where_the_angle_is_zero():
     task = replace(read(), observations=Observations((2, 2), (3, 3), (4, 4), read_noise=20, read_rotation=3, **LEGACY))
     images = ReferenceImages(5, noise=20)
-    rows = Rows([replace(task, images=images)] * 4000, seed=6)
-    angle = draw(torch.tensor(6), torch.arange(4000), torch.tensor(1), STREAM_STEP)[3] * 4 >> 32
+    rows = Rows([replace(task, images=images)] * 1600, seed=6)
+    angle = draw(torch.tensor(6), torch.arange(1600), torch.tensor(1), STREAM_STEP)[3] * 4 >> 32
 
     noise = rows.reset().observation[angle == 0, 0].long() - images.images[0]
 

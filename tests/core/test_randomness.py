@@ -137,7 +137,7 @@ def test_noise_is_new_at_every_observation():
 
 @pytest.mark.parametrize("p", [0.5, 0.9])
 def test_a_wait_state_is_kept_with_probability_p(p):
-    rows = 25_000
+    rows = 12_500
     env = CTGraphEnv([one_hot(p=p)] * rows, seed=1)
     env.reset()
     act(env, [0] * rows)
@@ -150,7 +150,7 @@ def test_a_wait_state_is_kept_with_probability_p(p):
 
 @pytest.mark.parametrize("p", [0.5, 0.9])
 def test_staying_once_says_nothing_about_staying_again(p):
-    rows = 25_000
+    rows = 12_500
     env = CTGraphEnv([one_hot(p=p)] * rows, seed=1, check_actions=False)
     env.reset()
     act(env, [0] * rows)
@@ -164,24 +164,24 @@ def test_staying_once_says_nothing_about_staying_again(p):
 
 
 def test_every_row_of_a_batch_waits_with_its_own_p():
-    env = CTGraphEnv([one_hot(p=0.0), one_hot(p=0.5)] * 10_000, seed=1)
+    env = CTGraphEnv([one_hot(p=0.0), one_hot(p=0.5)] * 5_000, seed=1)
     env.reset()
-    act(env, [0] * 20_000)
+    act(env, [0] * 10_000)
 
-    act(env, [0] * 20_000)
+    act(env, [0] * 10_000)
 
     stayed = env.state_type == WAIT
     assert not stayed[::2].any()
-    assert binomial_p_value(stayed[1::2].sum().item(), 10_000, 0.5) >= ALPHA
+    assert binomial_p_value(stayed[1::2].sum().item(), 5_000, 0.5) >= ALPHA
 
 
 def test_the_wait_the_id_and_the_angle_of_one_step_are_independent():
     task = confounding(p=0.5, read_rotation=1)
-    env = CTGraphEnv([task] * 20_000, seed=1)
+    env = CTGraphEnv([task] * 10_000, seed=1)
     env.reset()
-    act(env, [0] * 20_000)
+    act(env, [0] * 10_000)
 
-    observation = act(env, [0] * 20_000)["observation"][:, 0]
+    observation = act(env, [0] * 10_000)["observation"][:, 0]
 
     stayed, ids = env.state_type == WAIT, env.observation_id
     turned = (observation != task.images.images[ids]).flatten(1).any(1)

@@ -100,7 +100,7 @@ def test_a_step_reward_is_paid_at_every_step_in_addition():
 
 
 def test_additive_noise_has_the_mean_of_the_reward_and_the_given_deviation():
-    n = 40_000
+    n = 10_000
 
     paid = rewards_at_the_end(replace(surjective(), reward_std=0.5, goal_reward=2.0), n)
 
@@ -120,7 +120,7 @@ def test_additive_noise_is_paid_at_every_end_state_and_multiplicative_noise_only
 
 
 def test_multiplicative_noise_scales_with_the_reward():
-    n = 40_000
+    n = 10_000
 
     paid = rewards_at_the_end(replace(surjective(), reward_std=0.1, goal_reward=3.0, reward_noise="multiplicative"), n)
 

@@ -124,7 +124,7 @@ RETURNS = st.lists(st.one_of(st.sampled_from([-1.0, 0.0, 2.0]), MILLIONTHS), min
 LEVELS = st.integers(5, 99).map(lambda percent: percent / 100)
 
 
-@settings(max_examples=75, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(RETURNS, LEVELS, LEVELS)
 def test_an_interval_in_bounds_is_never_outside_nor_empty_and_grows_with_its_level(values, one, other):
     narrow, wide = (mean(values, level, bounds=(-1, 2)) for level in sorted((one, other)))

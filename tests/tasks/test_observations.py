@@ -99,27 +99,27 @@ def test_unique_ends_can_be_chosen_on_their_own():
 
 @pytest.mark.parametrize(("kind", "step", "first", "last"), [(WAIT, 1, 2, 9), (DECISION, 2, 10, 11), (END, 6, 12, 15)])
 def test_confounding_ids_are_uniform_over_their_range_with_both_ends(kind, step, first, last):
-    env = CTGraphEnv([confounding()] * 20_000, seed=1)
+    env = CTGraphEnv([confounding()] * 8_000, seed=1)
 
     ids, kinds, _ = ids_on_the_way(env)
 
     counts = torch.bincount(ids[step], minlength=16).tolist()
     assert (kinds[step] == kind).all()
-    assert sum(counts[first : last + 1]) == 20_000
+    assert sum(counts[first : last + 1]) == 8_000
     assert is_uniform(counts[first : last + 1])
 
 
 def test_a_confounding_wait_state_draws_an_id_at_every_observation():
-    env = CTGraphEnv([confounding(p=0.99)] * 20_000, seed=1)
+    env = CTGraphEnv([confounding(p=0.99)] * 8_000, seed=1)
     env.reset()
-    act(env, [0] * 20_000)
+    act(env, [0] * 8_000)
 
     before = env.observation_id.clone()
-    act(env, [0] * 20_000)
+    act(env, [0] * 8_000)
 
     stayed = env.state_type == WAIT
     changed = (env.observation_id != before)[stayed].sum().item()
-    assert binomial_p_value(stayed.sum().item(), 20_000, 0.99) >= ALPHA
+    assert binomial_p_value(stayed.sum().item(), 8_000, 0.99) >= ALPHA
     assert binomial_p_value(changed, stayed.sum().item(), 7 / 8) >= ALPHA
 
 
