@@ -112,10 +112,11 @@ def summary(name: str) -> str:
         found, own = [scores(lines) for lines in runs], areas(runs)
         values = {"forward transfer": transfer(own, alone, left_out)}
         values |= {column: mean_of([each[column] for each in found], bounds(column, runs[0])) for column in OF_A_RUN}
-        rows.append([f"`{method}`", str(len(found)), *(values[column] for column in COLUMNS)])
+        rows.append([f"`{method}`", *(values[column] for column in COLUMNS)])
     tasks = f"task {', '.join(map(str, left_out))}" if left_out else "none"
-    said = f"Experts: {len(experts)} seeds of each. Left out of forward transfer: {tasks}. {missing(name)}"
-    return f"{table(['method', 'seeds', *COLUMNS], rows)}\n\n{said}"
+    seeds = f"{len(experts)} seeds of each method and of the experts."
+    said = f"{seeds} Left out of forward transfer: {tasks}. {missing(name)}"
+    return f"{table(['method', *COLUMNS], rows)}\n\n{said}"
 
 
 def bounds(column: str, lines: Raw) -> tuple[float, float]:

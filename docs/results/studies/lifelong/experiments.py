@@ -22,6 +22,11 @@ MOST_NAMED = 12
 """Cells without results are named up to so many, apart from seeds; else counted."""
 
 
+def eight(name: str) -> str:
+    """The name of the raw results with 8 epochs of PPO, as its settings name, beside those with one."""
+    return f"epochs/{name}"
+
+
 def expected(name: str) -> dict[str, list[str]]:
     """What an experiment sweeps."""
     params = OmegaConf.load(CONF / f"{Path(name).name}.yaml").hydra.sweeper.params

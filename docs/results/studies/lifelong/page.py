@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from string import Template
 
-from studies.lifelong import comparison, epochs, pairs
-from studies.lifelong.experiments import EXPERIMENTS, MASKS
+from studies.lifelong import comparison, pairs
+from studies.lifelong.experiments import EXPERIMENTS, MASKS, eight
 from studies.raw import HERE, TEMPLATES, machines, read
 
 PAGE = HERE / "lifelong.md"
@@ -14,8 +14,8 @@ PAGE = HERE / "lifelong.md"
 def page() -> str:
     """The page of the methods: its template with its tables."""
     template = Template((TEMPLATES / "lifelong.md").read_text(encoding="utf-8"))
-    found = comparison.tables() | pairs.tables() | epochs.tables()
-    read_here = (*EXPERIMENTS, *map(epochs.eight, MASKS))
+    found = comparison.tables() | pairs.tables()
+    read_here = (*EXPERIMENTS, *map(eight, MASKS))
     return template.substitute(found, machines=machines(*read_here))
 
 
