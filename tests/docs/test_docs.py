@@ -130,12 +130,6 @@ def test_every_error_of_the_page_is_raised(refused, message):
     assert str(refusal.value) == message
 
 
-def test_the_page_quotes_the_two_errors_of_a_goal_as_they_are_raised_here():
-    quoted = re.findall(r"`ValueError: ([^`]+)`", PROSE)
-
-    assert quoted == [message for _, message in REFUSED if message.startswith("goal ")]
-
-
 def test_every_switch_of_the_page_exists_is_off_by_default_and_on_in_a_file():
     task = read(reward__min_static_reward_episodes=5, reward__max_static_reward_episodes=6)
 
