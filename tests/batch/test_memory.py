@@ -8,19 +8,15 @@ import sys
 import pytest
 import torch
 from helpers.oracles import fully_observable, surjective
+from helpers.scripted import PEAK
 
 from ctgraph_rl import CTGraph, Observations, PaperImages, Rows, Task
 
-MEASURE = """
-import re, torch
-from pathlib import Path
+MEASURE = f"""
+import torch
 from ctgraph_rl import Rows
 from ctgraph_rl.tasks.configurations import ct_co_b1
-
-def peak():
-    # resource.getrusage counts what the process was before exec, too: all of the tests
-    return 1024 * int(re.search(r"VmHWM:\\s+(\\d+) kB", Path("/proc/self/status").read_text())[1])
-
+{PEAK}
 task, before = ct_co_b1(), peak()
 rows = Rows([task] * 250_000)
 observation, done = rows.restart(), None

@@ -128,6 +128,15 @@ def first_training(log: RunLog) -> dict[str, float]:
     return {key: value for key, value in first.items() if key != "kind"}
 
 
+PEAK = """
+from pathlib import Path
+
+def peak():
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
+"""
+"""Code of the most bytes that its process has held; those of `resource.getrusage` include its parent's, before exec."""
+
 BARE = ("-c", "import os, torch, torchrl; os._exit(0)")
 RUN = ("-m", "ctgraph_rl.run", "agent=ppo", "curriculum=ct2_interfering", f"agent._target_={__name__}.UntilFirstStep")
 
