@@ -27,9 +27,9 @@ that are of no use, and training measures it. An evaluation that samples plays t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -41,9 +41,18 @@ from torchrl.data import Composite, TensorSpec
 from baselines.cells.cell import linear_layer
 from baselines.parts.distinct import distinct
 from baselines.parts.learner import require_finite
-from baselines.parts.networks import Data, guided, highest, is_greedy, num_actions_of, require_weights
+from baselines.parts.networks import Data, TensorsByName, guided, highest, is_greedy, num_actions_of, require_weights
 from baselines.update.update import minimise
-from ctgraph_rl.checks import TakesNumbers, at_least_one, fraction, positive, require, require_memory
+from ctgraph_rl.checks import (
+    NamedValues,
+    ReadOnlyValues,
+    TakesNumbers,
+    at_least_one,
+    fraction,
+    positive,
+    require,
+    require_memory,
+)
 from ctgraph_rl.learn.collect import UNSTORED
 
 PASSES = 5
@@ -432,7 +441,7 @@ class PennA(TakesNumbers, TensorDictModuleBase):
         after = {"trial": trial, "life": torch.full_like(trial, self.generation), WEIGHTS: weights, OUTPUTS: outputs}
         return tensordict.update({("next", key): value for key, value in after.items()})
 
-    def loss(self, batch: Data) -> dict[str, Tensor]:
+    def loss(self, batch: Data) -> TensorsByName:
         """Compute the autoencoder's loss; the population has none."""
         return {"loss_autoencoder": self.autoencoder.loss(batch["observation"])}
 
@@ -476,7 +485,7 @@ class PennA(TakesNumbers, TensorDictModuleBase):
         self.population = Population(*map(fn, self.population))
         return super()._apply(fn, recurse)
 
-    def get_extra_state(self) -> dict[str, Any]:
+    def get_extra_state(self) -> NamedValues:
         """Return what `state_dict` has beside tensors of one shape: the population, its age, the optimiser's state."""
         return {
             "population": self.population._asdict(),
@@ -485,7 +494,7 @@ class PennA(TakesNumbers, TensorDictModuleBase):
             "optimiser": self.optimiser.state_dict(),
         }
 
-    def set_extra_state(self, state: Mapping[str, Any]) -> None:
+    def set_extra_state(self, state: ReadOnlyValues) -> None:
         """Restore what `get_extra_state` returned."""
         self.population = Population(**state["population"])
         self.generation = state["generation"]

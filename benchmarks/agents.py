@@ -33,7 +33,7 @@ from benchmarks.environment_ladder import climbed, found, until
 from benchmarks.environment_ladder import table as ladder_table
 from benchmarks.environments import machine
 from ctgraph_rl import CTGraphEnv, Task, evaluate
-from ctgraph_rl.checks import at_least_one, positive, require
+from ctgraph_rl.checks import NamedValues, at_least_one, positive, require
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.learn.collect import collect
 from ctgraph_rl.log.escape import markdown_table
@@ -116,7 +116,7 @@ def cell_named(name: str) -> partial[Any]:
     return partial(entry.kind, **entry.settings)
 
 
-def settings(name: str) -> dict[str, Any]:
+def settings(name: str) -> NamedValues:
     """Return an agent's hyperparameters for `ROWS` rows, with as many frames in a batch as in its yaml file."""
     given = agent_named(name).settings
     frames = given["num_envs"] * given["num_steps"]

@@ -45,6 +45,9 @@ MAX_BUFFER = 2**26
 """Bytes of observations in the buffers: beyond the caches."""
 
 
+NamedRuns = Iterator[tuple[str, ladder.TimedRun]]
+"""Ways to step, by name."""
+
 NOISE_BANK = 4096
 SUFFIX = {"off": "", "required": ", kernel"}
 """What the table says of the ways by the values of ``kernel``."""
@@ -71,7 +74,7 @@ class Way:
     name: str
     configuration: str
     num_rows: int
-    run: Callable[[], int]  # runs for a while and says how many observations there were
+    run: ladder.TimedRun  # runs for a while and says how many observations there were
     speeds: list[float]
 
     def measure(self, seconds: float) -> None:
@@ -120,7 +123,7 @@ def _num_steps(num_rows: int) -> int:
     return max(4, min(512, MAX_BUFFER // (num_rows * 144)))
 
 
-def _memory(num_rows: int) -> Iterator[tuple[str, Callable[[], int]]]:
+def _memory(num_rows: int) -> NamedRuns:
     steps = _num_steps(num_rows)
     target = torch.empty(steps, num_rows, 1, 12, 12, dtype=torch.uint8, device="cpu")
     source = torch.randint(0, 255, target.shape, dtype=torch.uint8, device="cpu")
@@ -134,7 +137,7 @@ def _memory(num_rows: int) -> Iterator[tuple[str, Callable[[], int]]]:
     yield MEMCPY, partial(run, lambda row, t: row.copy_(source[t]))
 
 
-def _fast(task: Task, num_rows: int, ways: tuple[str, ...]) -> Iterator[tuple[str, Callable[[], int]]]:
+def _fast(task: Task, num_rows: int, ways: tuple[str, ...]) -> NamedRuns:
     rows = Rows([task] * num_rows)
     banked = Rows([task] * num_rows, noise_bank=NOISE_BANK)
     steps = Steps.empty(rows, _num_steps(num_rows))
@@ -157,9 +160,7 @@ def _fast(task: Task, num_rows: int, ways: tuple[str, ...]) -> Iterator[tuple[st
             yield f"fast rollout, noise bank{SUFFIX[kernel]}", partial(run, banked, kernel)
 
 
-def _torchrl(
-    make: Callable[[], EnvBase], prefix: str = "", suffix: str = ""
-) -> Iterator[tuple[str, Callable[[], int]]]:
+def _torchrl(make: Callable[[], EnvBase], prefix: str = "", suffix: str = "") -> NamedRuns:
     env = make()
     collected = make()
     n = env.batch_size[0]
@@ -200,7 +201,7 @@ class _Random(TensorDictModuleBase):
         return tensordict.set("action", torch.randint(0, 3, (self.num_rows,), device="cpu"))
 
 
-def _gymnasium(task: Task, num_rows: int, kernel: str) -> Iterator[tuple[str, Callable[[], int]]]:
+def _gymnasium(task: Task, num_rows: int, kernel: str) -> NamedRuns:
     envs = CTGraphVectorEnv(num_rows, task, kernel=kernel)
     envs.reset(seed=0)
     actions = torch.randint(0, 3, (16, num_rows), device="cpu").numpy()
@@ -213,7 +214,7 @@ def _gymnasium(task: Task, num_rows: int, kernel: str) -> Iterator[tuple[str, Ca
     yield f"Gymnasium VectorEnv{SUFFIX[kernel]}", run
 
 
-def _single(task: Task, kernel: str) -> Iterator[tuple[str, Callable[[], int]]]:
+def _single(task: Task, kernel: str) -> NamedRuns:
     env = CTGraphGymEnv(task, kernel=kernel)
     actions = torch.randint(0, 3, (256,), device="cpu").tolist()
     env.reset(seed=0)
@@ -231,7 +232,7 @@ def contenders(num_rows: list[int], names: list[str], with_kernel: bool) -> list
     """Everything that is measured, in the order of the table."""
     found: list[Way] = []
 
-    def add(configuration: str, n: int, ways: Iterator[tuple[str, Callable[[], int]]]) -> None:
+    def add(configuration: str, n: int, ways: NamedRuns) -> None:
         found.extend(Way(name, configuration, n, run, []) for name, run in ways)
 
     tasks = configurations()

@@ -6,7 +6,7 @@ import gc
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
@@ -14,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import ReadOnlyValues, require
 
 if TYPE_CHECKING:
     import torch
@@ -181,7 +181,7 @@ def class_named(module: str, name: str) -> type | None:
     return kind if isinstance(kind, type) and kind.__module__ == home.__name__ else None
 
 
-def profile_properties() -> Mapping[str, Any]:
+def profile_properties() -> ReadOnlyValues:
     """Return the properties of a profile by their curricula; see `curricula.profile`.
 
     Raises:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from baselines.cells.cell import Cell, CellState, linear_layer, zeros_like_weights
+from baselines.cells.cell import Cell, CellOutput, CellState, linear_layer, zeros_like_weights
 from baselines.cells.lstm import LSTM
 from baselines.cells.scan import linear_scan, max_scan
 from ctgraph_rl.checks import one_of, require, true_or_false
@@ -60,7 +60,7 @@ class AMRL(Cell):
         widths = [self.num_outputs // 2, 1][: 1 if self.is_max else 2]
         return (*self.inner.zeros(num_rows), *(zeros_like_weights(self, num_rows, width) for width in widths))
 
-    def step(self, inputs: Tensor, state: CellState) -> tuple[Tensor, CellState]:
+    def step(self, inputs: Tensor, state: CellState) -> CellOutput:
         """See `Cell`."""
         memory, inner = self.inner.step(inputs, state[:2])
         x, y = memory.chunk(2, dim=-1)
@@ -72,7 +72,7 @@ class AMRL(Cell):
         x, y = self.inner.sequence(inputs, groups, starts, state[:2]).chunk(2, dim=-1)
         return self._output(self._aggregate(x, starts, state[2:])[0], y)
 
-    def _aggregate(self, x: Tensor, starts: Tensor, state: CellState) -> tuple[Tensor, CellState]:
+    def _aggregate(self, x: Tensor, starts: Tensor, state: CellState) -> CellOutput:
         """Return the aggregates of [rows, steps, n] at each step, and the state after the last one."""
         if self.is_max:
             first = torch.maximum(state[0].unsqueeze(1), x[:, :1])

@@ -16,9 +16,9 @@ import math
 import torch
 from torch import Tensor, nn
 
-from baselines.cells.cell import Cell, CellState, episodes_of, linear_layer, of_frames, zeros_like_weights
-from baselines.cells.frames import MOST_FRAMES
-from ctgraph_rl.checks import at_least_one, at_most, is_int, require
+from baselines.cells.cell import Cell, CellOutput, CellState, episodes_of, linear_layer, of_frames, zeros_like_weights
+from baselines.cells.frames import checked_frames
+from ctgraph_rl.checks import at_least_one, require
 
 
 class Attention(Cell):
@@ -45,12 +45,10 @@ class Attention(Cell):
         self, num_features: int, num_outputs: int, num_actions: int, num_frames: int, num_heads: int, **reads: bool
     ) -> None:
         super().__init__(num_features, num_outputs, num_actions, **reads)
-        rule = f"num_frames must be an integer >= 2, got {num_frames!r}: one frame is cell=none"
-        require((is_int(num_frames, 2), rule), *at_most(MOST_FRAMES, num_frames=num_frames))
+        self.num_frames = checked_frames(num_frames)
         require(*at_least_one(num_heads=num_heads))
         divided = f"hidden_size must be a multiple of num_heads={num_heads}, got {num_outputs}"
         require((num_outputs % num_heads == 0, divided))
-        self.num_frames = num_frames
         self.num_heads = num_heads
         self.enter = linear_layer(self.num_inputs, num_outputs)
         self.attended = linear_layer(num_outputs, 3 * num_outputs)
@@ -70,7 +68,7 @@ class Attention(Cell):
         """Return zeros in place of earlier inputs, [num_rows, num_frames - 1, num_inputs + 1], oldest first."""
         return (zeros_like_weights(self, num_rows, self.num_frames - 1, self.num_inputs + 1),)
 
-    def step(self, inputs: Tensor, state: CellState) -> tuple[Tensor, CellState]:
+    def step(self, inputs: Tensor, state: CellState) -> CellOutput:
         """See `Cell`."""
         present = torch.cat([inputs, torch.ones_like(inputs[:, :1])], dim=1).unsqueeze(1)
         frames = torch.cat([state[0], present], dim=1)
@@ -96,15 +94,17 @@ class Attention(Cell):
             same: whether a frame is of a step's episode, bool [rows, num_steps, frames].
         """
         entered = self.enter(frames)
-        queries, keys, values = self.attended(self.first_norm(entered)).chunk(3, dim=-1)
-        queries, keys, values = (self._by_head(each) for each in (queries[:, -num_steps:], keys, values))
+        parts = self.attended(self.first_norm(entered)).chunk(3, dim=-1)
+        queries = self._by_head(parts[0][:, -num_steps:])
+        keys = self._by_head(parts[1])
+        values = self._by_head(parts[2])
         places = torch.arange(frames.shape[1], device=frames.device)
         distance = places[-num_steps:].unsqueeze(1) - places
         near = (distance >= 0) & (distance < self.num_frames)
         bias = self.bias[:, distance.clamp(0, self.num_frames - 1)]
         scores = queries @ keys.transpose(-1, -2) / math.sqrt(queries.shape[-1]) + bias
-        scores = scores.masked_fill(~(same & near).unsqueeze(1), -torch.inf)
-        attended = (scores.softmax(dim=-1) @ values).transpose(1, 2).flatten(2)
+        shares = scores.masked_fill(~(same & near).unsqueeze(1), -torch.inf).softmax(dim=-1)
+        attended = (shares @ values).transpose(1, 2).flatten(2)
         left = entered[:, -num_steps:] + self.leave(attended)
         return left + self.narrower(self.wider(self.second_norm(left)).relu())
 

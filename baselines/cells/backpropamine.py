@@ -24,7 +24,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from baselines.cells.cell import Cell, CellState, linear_layer, zeros_like_weights
+from baselines.cells.cell import Cell, CellOutput, CellState, linear_layer, zeros_like_weights
 from baselines.cells.plastic_sequence import Plastic, PlasticSequence, PlasticSteps, columns_times
 from ctgraph_rl.checks import one_of, require
 
@@ -76,7 +76,7 @@ class Backpropamine(Cell):
         matrices = (zeros_like_weights(self, num_rows, size, size) for _ in self.state_keys[1:])
         return (zeros_like_weights(self, num_rows, size), *matrices)
 
-    def step(self, inputs: Tensor, state: CellState) -> tuple[Tensor, CellState]:
+    def step(self, inputs: Tensor, state: CellState) -> CellOutput:
         """See `Cell`."""
         return self._step(self.input(inputs), state)
 
@@ -95,7 +95,7 @@ class Backpropamine(Cell):
         others = (weights for layer in layers for weights in (layer.weight, layer.bias))
         return Plastic(self.recurrent, self.plasticity, rate, *others)
 
-    def _step(self, given: Tensor, state: CellState, product: Tensor | None = None) -> tuple[Tensor, CellState]:
+    def _step(self, given: Tensor, state: CellState, product: Tensor | None = None) -> CellOutput:
         """Take a step from the inputs times their weights, [rows, H]; ``product`` is overwritten."""
         before, hebb, *trace = state
         fast = columns_times(before, torch.mul(self.plasticity, hebb, out=product))

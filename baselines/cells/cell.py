@@ -15,6 +15,9 @@ from ctgraph_rl.core.kernel import is_traced
 CellState = tuple[Tensor, ...]
 """The parts of a cell's state, [rows, ...] each, in the order of its ``state_keys``."""
 
+CellOutput = tuple[Tensor, CellState]
+"""What a cell writes in a step, and its next state."""
+
 Branches = Sequence[tuple[Tensor, Tensor]]
 """Of the histories of each length: which of the one shorter each continues, or which state, and the group of its last
 input; int64 [num_histories] each."""
@@ -67,7 +70,7 @@ class Cell(TakesNumbers, nn.Module):
         """Return the state at the start of an episode, which is zero: of each key [num_rows, num_outputs] here."""
         return tuple(zeros_like_weights(self, num_rows, self.num_outputs) for _ in self.state_keys)
 
-    def step(self, inputs: Tensor, state: CellState) -> tuple[Tensor, CellState]:
+    def step(self, inputs: Tensor, state: CellState) -> CellOutput:
         """Compute the outputs, [rows, num_outputs], and the next state from inputs, [rows, num_inputs], and a state."""
         raise NotImplementedError
 

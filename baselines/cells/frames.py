@@ -8,11 +8,22 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from baselines.cells.cell import Cell, CellState, episodes_of, linear_layer, of_frames, zeros_like_weights
+from baselines.cells.cell import Cell, CellOutput, CellState, episodes_of, linear_layer, of_frames, zeros_like_weights
 from ctgraph_rl.checks import at_most, is_int, require
 
 MOST_FRAMES = 1000
 """Beyond the longest episodes that fit into a batch."""
+
+
+def checked_frames(num_frames: int) -> int:
+    """Return a number of frames that a cell keeps.
+
+    Raises:
+        ValueError: for one frame, and more than `MOST_FRAMES`.
+    """
+    rule = f"num_frames must be an integer >= 2, got {num_frames!r}: one frame is cell=none"
+    require((is_int(num_frames, 2), rule), *at_most(MOST_FRAMES, num_frames=num_frames))
+    return num_frames
 
 
 class Frames(Cell):
@@ -31,16 +42,14 @@ class Frames(Cell):
 
     def __init__(self, num_features: int, num_outputs: int, num_actions: int, num_frames: int, **reads: bool) -> None:
         super().__init__(num_features, num_outputs, num_actions, **reads)
-        rule = f"num_frames must be an integer >= 2, got {num_frames!r}: one frame is cell=none"
-        require((is_int(num_frames, 2), rule), *at_most(MOST_FRAMES, num_frames=num_frames))
-        self.num_frames = num_frames
+        self.num_frames = checked_frames(num_frames)
         self.linear = linear_layer(num_frames * self.num_inputs, num_outputs)
 
     def zeros(self, num_rows: int) -> CellState:
         """Return zeros in place of earlier inputs, [num_rows, num_frames - 1, num_inputs], oldest first."""
         return (zeros_like_weights(self, num_rows, self.num_frames - 1, self.num_inputs),)
 
-    def step(self, inputs: Tensor, state: CellState) -> tuple[Tensor, CellState]:
+    def step(self, inputs: Tensor, state: CellState) -> CellOutput:
         """See `Cell`."""
         window = torch.cat([state[0], inputs.unsqueeze(1)], dim=1)
         return self.linear(window.flatten(1)).relu(), (window[:, 1:],)

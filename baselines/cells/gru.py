@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from baselines.cells.cell import Cell, CellState
+from baselines.cells.cell import Cell, CellOutput, CellState
 from baselines.cells.packed import segments
 from ctgraph_rl.core.kernel import is_traced
 
@@ -23,7 +23,7 @@ class GRU(Cell):
         super().__init__(num_features, num_outputs, num_actions, **reads)
         self.gru = nn.GRU(self.num_inputs, num_outputs, batch_first=True, dtype=torch.float32, device="cpu")
 
-    def step(self, inputs: Tensor, state: CellState) -> tuple[Tensor, CellState]:
+    def step(self, inputs: Tensor, state: CellState) -> CellOutput:
         """See `Cell`."""
         if is_traced():  # PyTorch's own cannot be vectorised over seeds
             num_rows = len(inputs)

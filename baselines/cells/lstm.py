@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from baselines.cells.cell import Branches, Cell, CellState, can_branch, of_frames, zeros_like_weights
+from baselines.cells.cell import Branches, Cell, CellOutput, CellState, can_branch, of_frames, zeros_like_weights
 from baselines.cells.packed import segments
 
 
@@ -26,7 +26,7 @@ class LSTM(Cell):
         """Return zeros, [num_rows, 1, num_outputs], for both parts of the state."""
         return tuple(zeros_like_weights(self, num_rows, 1, self.num_outputs) for _ in self.state_keys)
 
-    def step(self, inputs: Tensor, state: CellState) -> tuple[Tensor, CellState]:
+    def step(self, inputs: Tensor, state: CellState) -> CellOutput:
         """See `Cell`."""
         if not can_branch(inputs):
             h, c = lstm_step(self.lstm, lstm_inputs(self.lstm, inputs), state[0].squeeze(1), state[1].squeeze(1))

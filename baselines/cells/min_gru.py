@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from baselines.cells.cell import Cell, CellState, linear_layer, of_frames
+from baselines.cells.cell import Cell, CellOutput, CellState, linear_layer, of_frames
 from baselines.cells.scan import linear_scan
 
 
@@ -23,7 +23,7 @@ class MinGRU(Cell):
         self.gate = linear_layer(self.num_inputs, num_outputs)
         self.candidate = linear_layer(self.num_inputs, num_outputs)
 
-    def step(self, inputs: Tensor, state: CellState) -> tuple[Tensor, CellState]:
+    def step(self, inputs: Tensor, state: CellState) -> CellOutput:
         """See `Cell`."""
         carry, given = self._parts(inputs)
         output = carry * state[0] + given

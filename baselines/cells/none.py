@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from baselines.cells.cell import Cell, CellState, linear_layer, of_frames
+from baselines.cells.cell import Cell, CellOutput, CellState, linear_layer, of_frames
 
 
 class NoMemory(Cell):
@@ -17,7 +17,7 @@ class NoMemory(Cell):
         super().__init__(num_features, num_outputs, num_actions, **reads)
         self.linear = linear_layer(self.num_inputs, num_outputs)
 
-    def step(self, inputs: Tensor, state: CellState) -> tuple[Tensor, CellState]:
+    def step(self, inputs: Tensor, state: CellState) -> CellOutput:
         """See `Cell`."""
         return self.linear(inputs).relu(), ()
 

@@ -15,13 +15,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import linear
 
-from baselines.cells.cell import CellState
+from baselines.cells.cell import CellOutput, CellState
 
 
 class PlasticSteps(NamedTuple):
     """How the steps of a sequence are taken."""
 
-    step: Callable[[Tensor, CellState, Tensor], tuple[Tensor, CellState]]
+    step: Callable[[Tensor, CellState, Tensor], CellOutput]
     """Computes the units and the next state from the inputs times their weights, [rows, H], and a state; the third
     argument is overwritten, [rows, H, H]."""
 

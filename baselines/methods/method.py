@@ -182,6 +182,11 @@ class TaskMethod(Method):
         """Return the slot of a task."""
         return self.started.index(task) if task in self.started else 0
 
+    def other_slot(self, task: int) -> int | None:
+        """Return the slot of a task; None if it is the present one, and before any task has started."""
+        slot = self.slot_of(task)
+        return slot if self.started and slot != self.slot else None
+
     def present_with(self, task: int, inside: Tensor, kept: Tensor) -> Tensor | None:
         """Return the present weights with the part that belongs to the present task; None if that is the present one.
 
@@ -190,8 +195,8 @@ class TaskMethod(Method):
             inside: where in the vector of all weights the part is, bool [P].
             kept: the part of each slot, [slots, n].
         """
-        slot = self.slot_of(task)
-        if not self.started or slot == self.slot:
+        slot = self.other_slot(task)
+        if slot is None:
             return None
         weights = self.weights.vector()
         weights[inside.to(weights.device)] = kept[slot]

@@ -108,8 +108,8 @@ class PackNet(TaskMethod):
     @torch.no_grad()
     def task_weights(self, task: int) -> Tensor | None:
         """Return the weights of the tasks up to this one, with its output layers."""
-        slot = self.slot_of(task)
-        if not self.started or slot == self.slot:
+        slot = self.other_slot(task)
+        if slot is None:
             return None
         weights = torch.where(self._kept_up_to(slot), self.packed, 0.0)
         weights[self._on_device(self.in_heads)] = self.heads.kept[slot]

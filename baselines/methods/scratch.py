@@ -48,5 +48,5 @@ class Scratch(TaskMethod):
 
     def task_weights(self, task: int) -> Tensor | None:
         """Return the weights of the task's network."""
-        slot = self.slot_of(task)
-        return None if not self.started or slot == self.slot else self.kept[slot]
+        slot = self.other_slot(task)
+        return None if slot is None else self.kept[slot]

@@ -24,6 +24,7 @@ from baselines.update.update import update
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.core import philox
 from ctgraph_rl.core.region import Region
+from ctgraph_rl.learn.loop import Learnt
 
 AS_EVER = ("learn", "gradient_step", "minibatches", "after_update", "after_batch", "one_step", "reward", "advantages")
 """Methods of `PolicyGradient` that `CapturedGroup` has in its own form, for all seeds."""
@@ -161,14 +162,14 @@ class CapturedGroup(SeedGroup):
             written["next", PREVIOUS_ACTION] = written["action"]
         return written
 
-    def learn(self, batch: TensorDictBase) -> list[dict[str, float] | FloatingPointError]:
+    def learn(self, batch: TensorDictBase) -> list[Learnt]:
         """See `SeedGroup`."""
         measured = super().learn(batch)
         if any(isinstance(each, FloatingPointError) for each in measured):
             self.stack.read()
         return measured
 
-    def learnt(self, batch: TensorDictBase) -> list[dict[str, float] | FloatingPointError]:
+    def learnt(self, batch: TensorDictBase) -> list[Learnt]:
         """See `SeedGroup`; the host waits twice."""
         for method, part in zip(self.methods, batch.chunk(len(self.agents)), strict=False):
             method.on_batch(part)

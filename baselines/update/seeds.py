@@ -25,6 +25,7 @@ from baselines.update.compiled import compiler_options
 from baselines.update.stack import Stack
 from baselines.update.update import has_parts, update
 from ctgraph_rl.agent import Agent
+from ctgraph_rl.learn.loop import Learnt
 
 LARGEST_MINIBATCH = 512
 """Items of the largest minibatches that are stacked: with larger ones, products of one seed keep a core busy."""
@@ -168,7 +169,7 @@ class SeedGroup:
                 action.copy_(learner.exploration(TensorDict({"action": action}, action.shape))["action"])
         return {"action": actions}
 
-    def learn(self, batch: TensorDictBase) -> list[dict[str, float] | FloatingPointError]:
+    def learn(self, batch: TensorDictBase) -> list[Learnt]:
         """Let each agent learn from its rows of a batch, [seeds * num_envs, num_steps].
 
         Returns:
@@ -181,19 +182,19 @@ class SeedGroup:
                 clear(learner)
         return measured
 
-    def learnt(self, batch: TensorDictBase) -> list[dict[str, float] | FloatingPointError]:
+    def learnt(self, batch: TensorDictBase) -> list[Learnt]:
         """Learn, and return what `learn` does; an agent that failed keeps weights that are not finite."""
         parts = batch.chunk(len(self.agents))
         return self._learn_stacked(parts) if self.is_stacked else self._learn_in_turn(parts)
 
-    def _learn_in_turn(self, parts: Sequence[TensorDictBase]) -> list[dict[str, float] | FloatingPointError]:
+    def _learn_in_turn(self, parts: Sequence[TensorDictBase]) -> list[Learnt]:
         measured = []
         for number, (agent, part) in enumerate(zip(self.agents, parts, strict=True)):
             with self.random(number):
                 measured.append(or_error(agent.learn, part))
         return measured
 
-    def _learn_stacked(self, parts: Sequence[TensorDictBase]) -> list[dict[str, float] | FloatingPointError]:
+    def _learn_stacked(self, parts: Sequence[TensorDictBase]) -> list[Learnt]:
         for method, part in zip(self.methods, parts, strict=False):
             method.on_batch(part)
         numbered = iter(range(len(parts)))
@@ -203,9 +204,7 @@ class SeedGroup:
             for measured in self._learn_at_once(stack, [next(numbered) for _ in stack.learners], parts)
         ]
 
-    def _learn_at_once(
-        self, stack: Stack, numbers: Sequence[int], parts: Sequence[TensorDictBase]
-    ) -> list[dict[str, float] | FloatingPointError]:
+    def _learn_at_once(self, stack: Stack, numbers: Sequence[int], parts: Sequence[TensorDictBase]) -> list[Learnt]:
         """Let some of the agents learn as one stack."""
         stack.read()
         minibatches = {number: self.learners[number].minibatches(parts[number]) for number in numbers}
@@ -288,7 +287,7 @@ def _most_at_once(learner: Learner) -> int:
     return max(1, CACHED_BYTES // of_one)
 
 
-def or_error(measure: Callable[..., dict[str, float]], *given: Any) -> dict[str, float] | FloatingPointError:
+def or_error(measure: Callable[..., dict[str, float]], *given: Any) -> Learnt:
     """Return what a function measures, or its error where that is not finite."""
     try:
         return measure(*given)

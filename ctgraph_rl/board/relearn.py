@@ -10,12 +10,12 @@ import sys
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from omegaconf import DictConfig
 
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, require
 from ctgraph_rl.disk import write_whole
 from ctgraph_rl.runs import config
 from ctgraph_rl.runs.job import run_job
@@ -29,7 +29,7 @@ class Relearning(NamedTuple):
 
     seeds: Sequence[int]
     together: bool  # whether the seeds are trained as one batch
-    config: Mapping[str, Any]  # without the seed
+    config: ReadOnlyValues  # without the seed
     num_threads: int
     entry_point: str | None  # module:function of a learner that is not ours
     curriculum: str | None  # file of what it learns; None: what the configuration says
@@ -72,14 +72,14 @@ def learn_again(job: Relearning, folder: Path) -> None:
         run_job(*runs[0])
 
 
-def configuration(stored: Mapping[str, Any]) -> DictConfig:
+def configuration(stored: ReadOnlyValues) -> DictConfig:
     """Return the configuration whose settings a run stored, with the default of all that changes no result."""
     settings = dict(config.composed([]))
     settings |= {key: with_added(value) if isinstance(value, Mapping) else value for key, value in stored.items()}
     return DictConfig(settings)
 
 
-def _settings(job: Relearning, seed: int) -> dict[str, Any]:
+def _settings(job: Relearning, seed: int) -> NamedValues:
     """Return the settings of a seed, with the curriculum of the job's file if it has one."""
     target = "ctgraph_rl.tasks.curriculum.Curriculum.from_json"
     own = {} if job.curriculum is None else {"curriculum": {"_target_": target, "path_or_dict": job.curriculum}}

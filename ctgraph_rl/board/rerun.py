@@ -15,14 +15,14 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ctgraph_rl.board.isolate import Isolation, Limits, Outcome, run_isolated
 from ctgraph_rl.board.relearn import Relearning, run_dir_of
 from ctgraph_rl.board.rescore import NO_ROW, Check, differing, equal
 from ctgraph_rl.board.submission import MOST_BYTES_OF_A_FILE, Submission, SubmittedRun, counted, experts_of, log_sum
 from ctgraph_rl.board.two_samples import compare_samples
-from ctgraph_rl.checks import are_ints, is_int, require
+from ctgraph_rl.checks import ReadOnlyValues, are_ints, is_int, require
 from ctgraph_rl.disk import made_folder, open_own, read_regular, read_text, require_no_link, write_whole
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CURRICULUM, FAILURE, LOG, METRICS, MOST_BYTES_OF_A_REASON
@@ -207,7 +207,7 @@ def _with_its_curriculum(cell: RerunCell) -> Relearning:
     return cell.job._replace(curriculum=str(own))
 
 
-def is_portable(config: Mapping[str, Any]) -> bool:
+def is_portable(config: ReadOnlyValues) -> bool:
     """Return whether a configuration asks for the same bits on every CPU."""
     return config.get("portable") is True
 

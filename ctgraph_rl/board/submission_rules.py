@@ -10,10 +10,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 from ctgraph_rl.board.tracks import Track
-from ctgraph_rl.checks import ReadOnlyValues, Rule
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule
 from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.escape import listed
 from ctgraph_rl.log.provenance import NUMBERS, code_changes
@@ -131,7 +130,7 @@ def code_rules(runs: Sequence[Run]) -> Iterator[Rule]:
     yield not changed, f"the code has changed since the runs, {listed(changed)}: run again, or submit with that code"
 
 
-def _code_now(about: ReadOnlyValues) -> dict[str, Any]:
+def _code_now(about: ReadOnlyValues) -> NamedValues:
     """Return the code of this process, as far as a run's log names its parts; None for what cannot be found."""
     stored = about.get("sources") or {}
     found = sources_of(stored.keys() - {*SCRIPTS})

@@ -103,6 +103,9 @@ BY_ARGUMENTS = ("ioctl", "socket", "clone", "prctl")
 MISSING = ("clone3", "memfd_create", "memfd_secret", "io_uring_setup", "io_uring_enter", "io_uring_register", "shmget")
 """Calls that are refused as if this kernel lacked them: libraries then take others."""
 
+Instruction = tuple[int, int, int, int]
+"""Code, how many instructions to skip if it holds and if it does not, and the value."""
+
 
 def filter_of(machine: str | None = None) -> bytes | None:
     """Return the program for a kind of machine, that of this one by default; None where none is known."""
@@ -110,8 +113,8 @@ def filter_of(machine: str | None = None) -> bytes | None:
     return None if abi is None else b"".join(struct.pack("=HBBI", *each) for each in _program(abi))
 
 
-def _program(abi: Abi) -> list[tuple[int, int, int, int]]:
-    """Return the instructions: code, how many to skip if it holds and if it does not, and the value."""
+def _program(abi: Abi) -> list[Instruction]:
+    """Return the instructions of a program."""
     numbers = {name: columns[abi.column] for name, columns in CALLS.items()}
     found = [(LOAD, 0, 0, ABI_AT), (EQUAL, 1, 0, abi.id), (RETURN, 0, 0, KILL), (LOAD, 0, 0, NUMBER_AT)]
     if abi.others_from is not None:
@@ -127,24 +130,20 @@ def _program(abi: Abi) -> list[tuple[int, int, int, int]]:
     return [*found, (RETURN, 0, 0, ALLOW)]
 
 
-def _if(number: int, argument: int, tests: Sequence[tuple[int, int]], reason: int) -> list[tuple[int, int, int, int]]:
+def _if(number: int, argument: int, tests: Sequence[tuple[int, int]], reason: int) -> list[Instruction]:
     """Return the instructions that refuse a call if one of some tests of an argument holds."""
     skips = [(code, len(tests) - place - 1, 0, value) for place, (code, value) in enumerate(tests)]
     last = skips.pop()
     return _of_call(number, argument, [*skips, (last[0], 0, 1, last[3]), (RETURN, 0, 0, REFUSE | reason)])
 
 
-def _unless(
-    number: int, argument: int, tests: Sequence[tuple[int, int]], reason: int
-) -> list[tuple[int, int, int, int]]:
+def _unless(number: int, argument: int, tests: Sequence[tuple[int, int]], reason: int) -> list[Instruction]:
     """Return the instructions that refuse a call unless one of some tests of an argument holds."""
     skips = [(code, len(tests) - place, 0, value) for place, (code, value) in enumerate(tests)]
     return _of_call(number, argument, [*skips, (RETURN, 0, 0, REFUSE | reason)])
 
 
-def _of_call(
-    number: int, argument: int, instructions: list[tuple[int, int, int, int]]
-) -> list[tuple[int, int, int, int]]:
+def _of_call(number: int, argument: int, instructions: list[Instruction]) -> list[Instruction]:
     """Return instructions for one call, over the lower half of one of its arguments: the kernel reads no more of it."""
     load = (LOAD, 0, 0, ARGUMENTS_AT + 8 * argument)
     return [(EQUAL, 0, len(instructions) + 2, number), load, *instructions, (LOAD, 0, 0, NUMBER_AT)]

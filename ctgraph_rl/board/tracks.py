@@ -8,7 +8,7 @@ separate curriculum, and a learner may be given less than the track gives: each 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,7 +18,7 @@ from typing import Any
 
 import yaml
 
-from ctgraph_rl.checks import at_least_one, did_you_mean, is_int, require
+from ctgraph_rl.checks import ReadOnlyValues, at_least_one, did_you_mean, is_int, require
 from ctgraph_rl.metrics import METRICS
 from ctgraph_rl.packages import conf_dir
 from ctgraph_rl.runs import config
@@ -85,7 +85,7 @@ class Track:
     score: str
     seeds: tuple[int, ...]
     rungs: tuple[tuple[str, ...], ...]
-    less_given: tuple[Mapping[str, Any], ...] = ()
+    less_given: tuple[ReadOnlyValues, ...] = ()
     config_dir: Path | None = None
 
     @property

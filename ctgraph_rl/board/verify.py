@@ -20,7 +20,7 @@ from functools import partial
 from inspect import unwrap
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ctgraph_rl import parsers
 from ctgraph_rl.board.held_out import HELD_OUT, held_out_cells, held_out_checks
@@ -29,7 +29,7 @@ from ctgraph_rl.board.rerun import RERUN, RerunCell, cells_of, draw, learn_again
 from ctgraph_rl.board.rescore import RESCORED, Check, rescore
 from ctgraph_rl.board.submission import MOST_RUNS, VERIFICATION, Submission, read_submission
 from ctgraph_rl.board.two_samples import runs_needed
-from ctgraph_rl.checks import Rule, is_int, is_real, require
+from ctgraph_rl.checks import NamedValues, Rule, is_int, is_real, require
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.learn.progress import ProgressBar
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
@@ -290,7 +290,7 @@ def write_verification(
     for cell in () if plan is None else plan.cells:
         drawn += [run.run for run in cell.runs]
         seeds += () if cell.runs else cell.job.seeds
-    content: dict[str, Any] = {
+    content: NamedValues = {
         "schema": SCHEMA,
         "level": level_of(checks),
         "bits": not any(check.level == RERUN and not check.run for check in checks),  # false: scores were tested

@@ -6,14 +6,14 @@ import io
 import logging
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, redirect_stdout
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import ReadOnlyValues, require
 from ctgraph_rl.collective.summary import COLLECTIVE, FILES, describe_collective, read_collective, write_summary
 from ctgraph_rl.disk import made_folder
 from ctgraph_rl.learn.collective import ExchangeLike, Member, learn_collective
@@ -194,7 +194,7 @@ def _is_replaced(cfg: Any, runs: Runs) -> bool:
     return any(about is not None and code_changes(about, now) for about, now in begun)
 
 
-def _log(cfg: Any, members: Sequence[Member], run_dir: Path, saved: Mapping[str, Any] | None) -> RunLog:
+def _log(cfg: Any, members: Sequence[Member], run_dir: Path, saved: ReadOnlyValues | None) -> RunLog:
     """Return the collective's log, new or as it was at a checkpoint."""
     if saved is not None:
         (run_dir / METRICS).unlink(missing_ok=True)

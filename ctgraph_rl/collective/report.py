@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import NamedValues, require
 from ctgraph_rl.collective.summary import COLLECTIVE, RUN, WHAT, Collective, read_collective, tables
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.log.escape import csv_text, markdown_table, markdown_text
@@ -86,7 +86,7 @@ def write_report(paths: Sequence[Path | str], folder: Path) -> Path:
     return page
 
 
-def _row(collective: Collective) -> dict[str, Any]:
+def _row(collective: Collective) -> NamedValues:
     """Return the values of `COLUMNS`."""
     exchange = collective.config["exchange"]
     row = {**collective.about, "helps": len(collective.helps)}

@@ -27,26 +27,28 @@ def add_noise(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
         uint8 [N, 1, r, r].
     """
     if not torch.compiler.is_compiling():
-        return _added(images, start, read_noise)
+        return _add_noise(images, start, read_noise)
     return by_pixel(images, start, read_noise) if images.is_cuda else _opaque(images, start, read_noise)
 
 
 _NOISE_ROWS = 4096  # as many rows at once keep the work in the cache
 
 
-def _added(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
-    given = images, start, read_noise
+def _add_noise(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
     fits = images.dtype == torch.uint8 and start.shape == read_noise.shape == images.shape[:1]
-    if fits and kernel.takes(*given):
-        return kernel.add_noise(*given)
-    return by_parts(*given) if images.is_cpu else noisy(*given)
+    if fits and kernel.takes(images, start, read_noise):
+        return kernel.add_noise(images, start, read_noise)
+    if images.is_cpu:
+        return by_parts(images, start, read_noise)
+    return noisy(images, start, read_noise)
 
 
 def by_parts(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
     """`add_noise` on CPUs without C code."""
-    parts = zip(*(part.split(_NOISE_ROWS) for part in (images, start, read_noise)), strict=True)
-    noised = [noisy(*part) for part in parts]
-    return noised[0] if len(noised) == 1 else torch.cat(noised)
+    if len(images) <= _NOISE_ROWS:
+        return noisy(images, start, read_noise)
+    parts = map(noisy, images.split(_NOISE_ROWS), start.split(_NOISE_ROWS), read_noise.split(_NOISE_ROWS))
+    return torch.cat(list(parts))
 
 
 def noisy(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
@@ -69,7 +71,7 @@ def by_pixel(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
 
 # Inductor of torch 2.13 writes beyond its buffers on a CPU when it fuses `noisy` with what comes before it, and in C++
 # numbers of `by_pixel` may not leave the range of int64. As its own operator the noise stays whole there.
-_opaque = torch.library.custom_op("ctgraph_rl::add_noise", _added, mutates_args=())
+_opaque = torch.library.custom_op("ctgraph_rl::add_noise", _add_noise, mutates_args=())
 _opaque.register_fake(lambda images, start, read_noise: torch.empty_like(images))
 
 
@@ -134,6 +136,9 @@ def turn(images: Tensor, angle: Tensor, taps: tuple[Tensor, Tensor]) -> Tensor:
     Returns:
         uint8 [N, 1, r, r].
     """
-    index, weight = (table[angle] for table in taps)
-    sources = images.flatten(1).to(torch.int64).gather(1, index.flatten(1)).view(index.shape)
-    return (((sources * weight).sum(-1) + (1 << 15)) >> 16).to(torch.uint8).view(images.shape)
+    index = taps[0][angle]
+    weight = taps[1][angle]
+    pixels = images.flatten(1).to(torch.int64)
+    sources = pixels.gather(1, index.flatten(1)).view(index.shape)
+    rounded = ((sources * weight).sum(-1) + (1 << 15)) >> 16
+    return rounded.to(torch.uint8).view(images.shape)

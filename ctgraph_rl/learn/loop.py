@@ -29,6 +29,10 @@ SavedState = ReadOnlyValues
 """All that the rest of a member's run depends on, as tensors and plain values."""
 
 
+Learnt = dict[str, float] | FloatingPointError
+"""What an agent measured while it learned from a batch, or the error that names what is not finite."""
+
+
 class Progress(Protocol):
     """What the loop reports to while it runs."""
 
@@ -108,7 +112,7 @@ class Group(Protocol):
         """See `ctgraph_rl.agent.Agent`."""
         ...
 
-    def learn(self, batch: TensorDictBase) -> Sequence[dict[str, float] | FloatingPointError]:
+    def learn(self, batch: TensorDictBase) -> Sequence[Learnt]:
         """Learn from a batch, [agents * num_envs, num_steps]; return what each agent measured, or raised.
 
         An agent that raised gets batches as before. Neither then nor later does it change a bit of another's.
@@ -141,7 +145,7 @@ class Alone:
         """See `Group`."""
         self.agents[0].end_task()
 
-    def learn(self, batch: TensorDictBase) -> list[dict[str, float] | FloatingPointError]:
+    def learn(self, batch: TensorDictBase) -> list[Learnt]:
         """See `Group`."""
         try:
             return [self.agents[0].learn(batch)]
@@ -369,7 +373,7 @@ def run_loop(
             checkpoint(members.state, members.is_at_block_end)
 
 
-def _finite(measured: dict[str, float] | FloatingPointError) -> dict[str, float]:
+def _finite(measured: Learnt) -> dict[str, float]:
     """Return what was measured.
 
     Raises:

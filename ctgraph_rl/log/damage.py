@@ -6,11 +6,11 @@ Runs of earlier versions have no `ctgraph_rl.log.sums.SUMS`: of theirs it is che
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ctgraph_rl.checks import is_real, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_real, require
 from ctgraph_rl.disk import read_regular
 from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG, METRICS
 from ctgraph_rl.log.measurement import LARGEST
@@ -30,7 +30,7 @@ def damaged(run_dir: Path) -> list[str]:
     return [SUMS] if not sums else [name for name in sums if not _is_same(run_dir / name, sums[name])]
 
 
-def _is_same(path: Path, stored: Mapping[str, Any]) -> bool:
+def _is_same(path: Path, stored: ReadOnlyValues) -> bool:
     there = path.is_file() and path.stat().st_size == stored.get("bytes")
     return there and sha256_of(path, MOST_BYTES_OF_A_FILE) == stored.get("sha256")
 
@@ -63,7 +63,7 @@ def _is_readable(path: Path, check: Callable[[Path], bool]) -> bool:
         return False
 
 
-def metrics_of(content: bytes) -> dict[str, Any]:
+def metrics_of(content: bytes) -> NamedValues:
     """Return what `metrics_text` has written, as plain values by name.
 
     Raises:

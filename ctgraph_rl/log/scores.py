@@ -16,6 +16,7 @@ from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.metrics import Curves, Metric, Undefined
 from ctgraph_rl.metrics.adaptation import Adaptation
 from ctgraph_rl.metrics.labels import SEVERAL, Labelling
+from ctgraph_rl.metrics.record import float64
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.task_like import TaskLike
 from ctgraph_rl.tasks.observability import POLICIES, state_entropy
@@ -160,7 +161,7 @@ def lowest_returns(tasks: Sequence[TaskLike]) -> Tensor | Undefined:
     """Each task's return of a failure, of others than CT-graphs the lowest mean return, float64 [tasks]."""
     if not are_graphs(tasks):
         return _said_by(tasks, "return_bounds", lambda task: task.return_bounds[0])
-    return _numbers([task.fail_reward for task in tasks])
+    return float64([task.fail_reward for task in tasks])
 
 
 def _said_by(tasks: Sequence[TaskLike], member: str, value: Callable[[Any], float]) -> Tensor | Undefined:
@@ -173,13 +174,9 @@ def _said_by(tasks: Sequence[TaskLike], member: str, value: Callable[[Any], floa
 def _of_each(value: Callable[[Any], float], tasks: Sequence[Any]) -> Tensor | Undefined:
     """Return a value of each task; the reason of the first that has none."""
     try:
-        return _numbers(list(map(value, tasks)))
+        return float64(list(map(value, tasks)))
     except ValueError as error:
         return Undefined(str(error))
-
-
-def _numbers(values: Sequence[float]) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64, device="cpu")
 
 
 def mastered_returns(tasks: Sequence[TaskLike]) -> Tensor | Undefined:
@@ -213,7 +210,7 @@ def _curves(log: RunLog, curriculum: Curriculum) -> Curves:
     """The evaluation curves; where nothing was evaluated, one evaluation without values."""
     if any(not m.get("held_out") for m in log.of_kind("evaluation")):
         return log.curves(curriculum.trained)
-    nothing = _numbers([math.nan] * len(curriculum.tasks)).unsqueeze(0)
+    nothing = float64([math.nan] * len(curriculum.tasks)).unsqueeze(0)
     return Curves(nothing, (0,), (0,), curriculum.trained)
 
 
@@ -225,7 +222,7 @@ def _interval_best(log: RunLog, curriculum: Curriculum, best: Tensor | Undefined
     for block in curriculum.trained:
         values = set(best[list(block)].tolist())
         alone.append(values.pop() if len(values) == 1 else math.nan)
-    return _numbers(alone)[log.training("block").long() - 1]
+    return float64(alone)[log.training("block").long() - 1]
 
 
 def _labelling(log: RunLog, curriculum: Curriculum) -> Labelling | Undefined:
@@ -262,7 +259,7 @@ def _first_blocks(log: RunLog, curriculum: Curriculum) -> NamedValues:
     if reason is not None:
         return dict.fromkeys(("first_frames", "first_episodes", "first_success_rates"), Undefined(reason))
     starts = (0, *curriculum.ends)
-    nothing = _numbers([])
+    nothing = float64([])
     frames = log.training_by_block("frames")
     episodes = log.training_by_block("episodes")
     success_rates = log.training_by_block("success_rate")

@@ -20,7 +20,7 @@ from ctgraph_rl.metrics.bounds import (
     of_sums,
     of_sums_over_time,
 )
-from ctgraph_rl.metrics.record import HERE, MASTERED, Undefined, defined, ratio
+from ctgraph_rl.metrics.record import HERE, MASTERED, Undefined, defined, float64, ratio
 
 CONTINUAL_WORLD = "Wolczyk et al. 2021, Continual World (arXiv 2105.10919)"
 LABS = "Ben-Iwhiwhu et al. 2022, Lifelong RL with modulating masks (arXiv 2212.11110)"
@@ -234,7 +234,7 @@ def frames_to_mastery(curves: Curves, threshold: Tensor | float = MASTERED) -> T
             found.append(_frames_to(needed[task], curves, block, task))
     if not found:
         raise Undefined("the definition needs a block that trains one task")
-    return torch.tensor(found, dtype=torch.float64, device="cpu")
+    return float64(found)
 
 
 def _frames_to(needed: Tensor, curves: Curves, block: int, task: int) -> float:

@@ -98,6 +98,10 @@ class Row:
         return self.agent if self.seed is None else f"{self.agent}, seed {self.seed}"
 
 
+MeasureLine = tuple[str, Estimate, str, str]
+"""Measure, estimate, definition and note."""
+
+
 def table(runs: Sequence[Run], statistics: str = "exact", count: Count = silent) -> list[Row]:
     """Every metric, and how tasks ended, for each agent on each curriculum.
 
@@ -129,8 +133,8 @@ def rows_by_seed(runs: Sequence[Run]) -> list[Row]:
     return rows
 
 
-def _lines(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[tuple[str, Estimate, str, str]]:
-    """Yield measure, estimate, definition and note of each row of an agent."""
+def _lines(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[MeasureLine]:
+    """Yield what the rows of an agent hold."""
     yield from _metrics(by_seed, bounds, kind)
     yield from _at_the_end(by_seed, bounds, kind)
 
@@ -223,7 +227,7 @@ def write_tidy(path: Path, runs: Sequence[Run]) -> None:
     write_evaluations(path, logs)
 
 
-def _metrics(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[tuple[str, Estimate, str, str]]:
+def _metrics(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[MeasureLine]:
     """A line for each metric; one for all if no run finished."""
     definitions: dict[str, str] = {}
     for run in present(by_seed):
@@ -259,7 +263,7 @@ def _over_seeds(values: Sequence[float | None], bounds: statistics.LowHigh, kind
     return mean(values, bounds=bounds)
 
 
-def _at_the_end(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[tuple[str, Estimate, str, str]]:
+def _at_the_end(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[MeasureLine]:
     """Return and share of solved tasks, the interquartile mean of returns, and each task's share of solved seeds."""
     tasks: dict[str, None] = {}
     own: dict[str, None] = {}
@@ -282,7 +286,7 @@ def _at_the_end(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[tu
         yield _ended(f"solved {task}", estimate, by_seed)
 
 
-def _over_tasks(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[tuple[str, Estimate, str, str]]:
+def _over_tasks(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[MeasureLine]:
     """Means over tasks that are not held out, of what was measured last; a seed needs a value of each."""
     returns: list[float | None] = [None] * len(by_seed)
     solved = returns.copy()
@@ -294,7 +298,7 @@ def _over_tasks(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[tu
     yield _ended("solved_rate", _over_seeds(solved, (0.0, 1.0), kind), by_seed)
 
 
-def _ended(measure: str, estimate: Estimate, by_seed: BySeed) -> tuple[str, Estimate, str, str]:
+def _ended(measure: str, estimate: Estimate, by_seed: BySeed) -> MeasureLine:
     return measure, estimate, AT_END[measure.split(" ")[0]].id, _note(by_seed, None, estimate)
 
 

@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, require
 from ctgraph_rl.log.escape import figure_text, terminal_text
 from ctgraph_rl.visualize.style import import_matplotlib
 
@@ -121,7 +121,7 @@ def panels(count: int, most: int, height: float, width: float = 1, room: float =
     return grid
 
 
-def agents_legend(figure: Any, looks: Iterable[tuple[str, Mapping[str, Any]]]) -> None:
+def agents_legend(figure: Any, looks: Iterable[tuple[str, ReadOnlyValues]]) -> None:
     """Names of agents above all panels, with the looks of their curves."""
     from matplotlib.lines import Line2D
 
@@ -129,7 +129,7 @@ def agents_legend(figure: Any, looks: Iterable[tuple[str, Mapping[str, Any]]]) -
     figure.legend(handles=marks, loc="outside upper left", ncols=min(beside(3), len(marks)))
 
 
-def agent_style(position: int, agent: str = "") -> dict[str, Any]:
+def agent_style(position: int, agent: str = "") -> NamedValues:
     """Colour, line and mark of an agent's curve, by its place and its name; needs `style`."""
     from matplotlib import rcParams
 

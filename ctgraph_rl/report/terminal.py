@@ -10,13 +10,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from statistics import fmean
-from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import ReadOnlyValues, require
 from ctgraph_rl.log.escape import listed, terminal_text
 from ctgraph_rl.log.provenance import numbers_of
 from ctgraph_rl.report.formats import measure_name
@@ -172,7 +171,7 @@ def _shown(value: float) -> str:
     return "-" if math.isnan(value) else f"{value:z.2f}"
 
 
-def metrics_table(metrics: Mapping[str, Mapping[str, Any]]) -> Table:
+def metrics_table(metrics: Mapping[str, ReadOnlyValues]) -> Table:
     """Return the main metrics with their definitions, or why one is undefined; others where they have a value."""
     table = Table(title=f"Metrics; metrics.json has all {len(metrics)}")
     for name, justify in (("metric", "left"), ("value", "right"), ("definition", "left")):

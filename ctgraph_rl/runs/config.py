@@ -27,7 +27,17 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.basecontainer import BaseContainer
 from omegaconf.errors import OmegaConfBaseException
 
-from ctgraph_rl.checks import Function, NamedValues, Rule, did_you_mean, is_int, nearest, positive, require
+from ctgraph_rl.checks import (
+    Function,
+    NamedValues,
+    ReadOnlyValues,
+    Rule,
+    did_you_mean,
+    is_int,
+    nearest,
+    positive,
+    require,
+)
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.packages import check_packages, conf_dir, curriculum_named, importing_from_here
 from ctgraph_rl.portable import check_portable
@@ -125,7 +135,7 @@ def of_seed(cfg: DictConfig, seed: int, run_dir: Path) -> tuple[DictConfig, Path
     return own, folder / name_of(own, choices)
 
 
-def of_member(cfg: DictConfig, number: int, settings: Mapping[str, Any]) -> DictConfig:
+def of_member(cfg: DictConfig, number: int, settings: ReadOnlyValues) -> DictConfig:
     """Return the configuration of a member of a collective: its seed, and its curriculum if they differ.
 
     Args:

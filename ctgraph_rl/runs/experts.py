@@ -13,9 +13,9 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from ctgraph_rl.checks import ReadOnlyValues, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, require
 from ctgraph_rl.disk import made_folder
 from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.files import CHECKPOINTS, LOG, METRICS, locked
@@ -46,7 +46,7 @@ class Expert(NamedTuple):
     run_dir: Path
 
     @property
-    def about(self) -> dict[str, Any]:
+    def about(self) -> NamedValues:
         """Plain values for the log; ``together`` where it was trained in a group of seeds."""
         together = begun_with(self.run_dir)
         group = {"together": together} if together else {}

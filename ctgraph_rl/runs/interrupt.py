@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any
 
 STOPPING = ("SIGINT", "SIGTERM", "SIGUSR2")
@@ -41,9 +41,7 @@ class Interrupt:
                     self._before[number] = signal.signal(number, self._ask)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._restore()
         if kind is None:
             self.check()

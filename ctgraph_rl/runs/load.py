@@ -15,7 +15,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 
 from ctgraph_rl.agent import Agent, MethodLike
-from ctgraph_rl.checks import ReadOnlyValues, as_path, is_int, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, as_path, is_int, require
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.learn.labels import policies_by_label
 from ctgraph_rl.log.escape import terminal_text
@@ -175,7 +175,7 @@ def _ours(run_dir: Path, part: str, settings: Any) -> Callable[..., Any]:
     return partial(kind, **_settings(run_dir, with_added(settings)))
 
 
-def _settings(run_dir: Path, stored: ReadOnlyValues) -> dict[str, Any]:
+def _settings(run_dir: Path, stored: ReadOnlyValues) -> NamedValues:
     """Return the settings of a class, with what builds its cell in place of the cell's settings."""
     given = {key: value for key, value in stored.items() if key not in ("_target_", "_partial_")}
     has_cell = isinstance(given.get("cell"), Mapping)

@@ -21,7 +21,7 @@ from hydra.errors import ConfigCompositionException, HydraException, MissingConf
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, read_write
 
-from ctgraph_rl.checks import ReadOnlyValues, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, require
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CHECKPOINTS, member_folder
 from ctgraph_rl.packages import check_packages, conf_dir
@@ -92,7 +92,7 @@ class Sweeper(Base):
         self._values: dict[str, tuple[str, Any] | None] = {}
         self._stale: dict[Path, str] = {}
         self._begun: dict[Path, tuple[int, ...]] = {}
-        self._known: dict[str, dict[str, Any]] = {}
+        self._known: dict[str, NamedValues] = {}
         self._num_unknown = 0
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:

@@ -14,7 +14,17 @@ from itertools import accumulate
 from os import PathLike
 from typing import Any
 
-from ctgraph_rl.checks import LARGEST_INT, Rule, as_path, as_tuple, is_int, make_fields_plain, require
+from ctgraph_rl.checks import (
+    LARGEST_INT,
+    NamedValues,
+    ReadOnlyValues,
+    Rule,
+    as_path,
+    as_tuple,
+    is_int,
+    make_fields_plain,
+    require,
+)
 from ctgraph_rl.tasks.curriculum_json import read_curriculum, type_name, write_curriculum
 from ctgraph_rl.tasks.kinds.task_like import TaskLike, are_tasks
 from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
@@ -201,7 +211,7 @@ class Curriculum:
             trained.append(tuple(position[task] for task in dict.fromkeys(block.tasks)))
         return tuple(trained)
 
-    def to_json(self, path: str | PathLike[str] | None = None) -> dict[str, Any]:
+    def to_json(self, path: str | PathLike[str] | None = None) -> NamedValues:
         """This curriculum as JSON with every field written out; see `ctgraph_rl.tasks.curriculum_json`.
 
         Args:
@@ -213,7 +223,7 @@ class Curriculum:
         return write_curriculum(self, None if path is None else as_path("path", path))
 
     @classmethod
-    def from_json(cls, path_or_dict: str | PathLike[str] | Mapping[str, Any]) -> Curriculum:
+    def from_json(cls, path_or_dict: str | PathLike[str] | ReadOnlyValues) -> Curriculum:
         """The curriculum that `to_json` wrote. Only types of this package are made.
 
         Args:

@@ -147,8 +147,8 @@ class Masks(TaskMethod):
     @torch.no_grad()
     def task_weights(self, task: int) -> Tensor | None:
         """Return the masked weights of a task."""
-        slot = self.slot_of(task)
-        return None if not self.started or slot == self.slot else _masked(self.scores[slot], self.constant)
+        slot = self.other_slot(task)
+        return None if slot is None else _masked(self.scores[slot], self.constant)
 
     @torch.no_grad()
     def scores_of(self, task: int) -> Tensor:

@@ -25,7 +25,7 @@ class Weights:
     def __init__(self, policy: TensorDictModuleBase, parameters: Sequence[nn.Parameter]) -> None:
         self.sizes = [parameter.numel() for parameter in parameters]
         names = {id(parameter): name for name, parameter in policy.named_parameters()}
-        within = all(id(parameter) in names for parameter in parameters)
+        within = {id(parameter) for parameter in parameters} <= names.keys()
         require((within, "the weights of an agent must all be parameters of its policy"))
         self.names = [names[id(parameter)] for parameter in parameters]
         self.parameters = list(parameters)
@@ -107,7 +107,7 @@ def head_names(policy: TensorDictModuleBase, without: str | None = None) -> list
     for place, module in policy.named_modules():
         behind = isinstance(module, TensorDictModule) and isinstance(module.module, nn.Module)
         if behind and "observation" not in module.in_keys and without not in module.out_keys:
-            layers = [name for name, layer in module.named_modules() if isinstance(layer, nn.Linear)]
-            parts = ("weight", "bias") if layers else ()
-            names += [".".join(filter(None, (place, layers[-1], part))) for part in parts]
+            layers = [name for name, layer in module.named_modules(prefix=place) if isinstance(layer, nn.Linear)]
+            if layers:
+                names += [f"{layers[-1]}.weight", f"{layers[-1]}.bias"]
     return names

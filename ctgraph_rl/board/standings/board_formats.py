@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import yaml
@@ -12,7 +12,7 @@ from ctgraph_rl.board.method_yaml import OURS
 from ctgraph_rl.board.standings.board_tables import BoardTable, Standing, is_significant
 from ctgraph_rl.board.standings.entries import LEVELS, shown_level
 from ctgraph_rl.board.standings.track_ceilings import in_words
-from ctgraph_rl.checks import NamedValues
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues
 from ctgraph_rl.log.escape import csv_text, markdown_table, markdown_text
 from ctgraph_rl.metrics import METRICS
 from ctgraph_rl.report.formats import MEANS, measure_name
@@ -260,7 +260,7 @@ def _numbers(estimate: Estimate) -> NamedValues:
 
 def model_index(tables: Sequence[BoardTable]) -> str:
     """Return the results file that model hubs read, as YAML: ``model-index`` of the Hugging Face Hub."""
-    found: dict[str, list[Mapping[str, Any]]] = {}
+    found: dict[str, list[ReadOnlyValues]] = {}
     for table in tables:
         for line in table.standings:
             found.setdefault(line.entry.name, []).append(_result(table, line))

@@ -14,7 +14,7 @@ from ctgraph_rl.board.method_yaml import track_version
 from ctgraph_rl.board.rescore import MEASURES, Check
 from ctgraph_rl.board.submission import METHOD, METRICS, RUNS, VERIFICATION, Submission, read_submission
 from ctgraph_rl.board.tracks import Track, Variant
-from ctgraph_rl.checks import repeated, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, repeated, require
 from ctgraph_rl.disk import read_regular
 from ctgraph_rl.log.escape import listed
 from ctgraph_rl.report.bounds_of_runs import bounds_of_curriculum
@@ -70,7 +70,7 @@ class BoardEntry:
     """
 
     digest: str
-    method: Mapping[str, Any]
+    method: ReadOnlyValues
     track: Track
     variant: Variant
     verification: Verification
@@ -225,7 +225,7 @@ def verification_of(submission: Submission) -> Verification:
     return Verification(OF_FILES[found["level"]], found["bits"])
 
 
-def _plain(found: Any) -> dict[str, Any]:
+def _plain(found: Any) -> NamedValues:
     """Return what a ``verification.json`` says, if its level follows from its checks.
 
     Raises:
