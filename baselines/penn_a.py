@@ -487,12 +487,8 @@ class PennA(TakesNumbers, TensorDictModuleBase):
 
     def get_extra_state(self) -> NamedValues:
         """Return what `state_dict` has beside tensors of one shape: the population, its age, the optimiser's state."""
-        return {
-            "population": self.population._asdict(),
-            "generation": self.generation,
-            "lived": self.lived,
-            "optimiser": self.optimiser.state_dict(),
-        }
+        counts = {"generation": self.generation, "lived": self.lived}
+        return {"population": self.population._asdict(), **counts, "optimiser": self.optimiser.state_dict()}
 
     def set_extra_state(self, state: ReadOnlyValues) -> None:
         """Restore what `get_extra_state` returned."""
