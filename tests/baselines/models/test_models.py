@@ -52,7 +52,7 @@ def test_a_table_cannot_be_the_model_of_a_task_that_needs_memory():
 @pytest.mark.slow
 def test_a_gru_is_the_exact_model_of_a_task_that_needs_memory():
     task = surjective(2, 2, 0.5, goal=(1, 2))
-    assert share_learned(GRUModel, task, 256, NavigationPolicy, "navigation") == pytest.approx(1, abs=0.05)
+    assert share_learned(GRUModel, task, 128, NavigationPolicy, "navigation") == pytest.approx(1, abs=0.05)
 
 
 def test_a_table_forgets_where_its_tasks_disagree():
