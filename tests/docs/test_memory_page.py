@@ -382,4 +382,4 @@ def test_what_the_page_says_in_words_of_the_ladder_holds(names):
     assert "these agents leave wait states at once" in PAGE
     assert {float(line["training_return"]) for line in short} == {0.0}
     at_100 = [float(line["training_length"]) for lines in of["2", "100"].values() for line in lines]
-    assert f"{sum(each < 10 for each in at_100)} of {len(at_100)} runs end so" in PAGE
+    assert f"{sum(each < 10 for each in at_100)} of {len(at_100)} runs end in the same way" in PAGE

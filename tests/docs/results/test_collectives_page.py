@@ -183,6 +183,9 @@ def test_what_the_text_says_of_eight_epochs_holds():
         for name in ("final_return", "reported_return", "obtained_return")
     }
 
+    seeds = [str(len(l2d2c(members, 8))) for members in (1, 4, 16)]
+
+    assert "With 8 epochs ({}, {} and {} seeds) the final".format(*seeds) in PAGE
     assert "return is {} with one learner, {} with 4 members and {} with 16".format(*numbers["final_return"]) in PAGE
     assert f"from {mean(of_block[2]):.2f} in the second to {mean(of_block[16]):.2f} in the last" in PAGE
     assert "had a reported return of {} with 4 members and {} with 16".format(*numbers["reported_return"]) in PAGE
