@@ -17,7 +17,7 @@ from ctgraph_rl.log.files import AGENT, LOG
 from ctgraph_rl.log.measurement import without_time
 from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.log.run_log import RunLog
-from ctgraph_rl.log.saved import bits_of, content_of, read_plain
+from ctgraph_rl.log.saved import read_content, read_plain, view_bits
 from ctgraph_rl.parsers import BOUND
 from ctgraph_rl.runs.settings import ADDED, as_before, flat
 
@@ -186,7 +186,7 @@ def _weights(one: Path, other: Path) -> str:
 
 def _state(path: Path) -> ReadOnlyValues:
     """Return what an agent saved."""
-    content = content_of(path)
+    content = read_content(path)
     try:
         state = read_plain(content)
         require((isinstance(state, Mapping), "holds no state of an agent"))
@@ -199,7 +199,7 @@ def _same(one: Any, other: Any) -> bool:
     """Return whether two plain values are equal, tensors bit by bit."""
     if isinstance(one, torch.Tensor) and isinstance(other, torch.Tensor):
         alike = (one.dtype, one.shape) == (other.dtype, other.shape)
-        return alike and torch.equal(bits_of(one), bits_of(other))
+        return alike and torch.equal(view_bits(one), view_bits(other))
     if isinstance(one, (list, tuple)) and isinstance(other, (list, tuple)):
         return len(one) == len(other) and all(map(_same, one, other))
     if isinstance(one, Mapping) and isinstance(other, Mapping):

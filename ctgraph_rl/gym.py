@@ -305,7 +305,7 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
 
     def _start_streams(self, mask: NDArray[np.bool_], seed: int | Sequence[int | None] | None) -> None:
         """Start random streams in the rows of a mask that are given a seed, and in all at first."""
-        seeds = self._seeds_of(seed)
+        seeds = self._spread_seed(seed)
         given = np.array([one is not None for one in seeds])
         start = mask & given if self._is_seeded else mask
         if start.any():
@@ -316,7 +316,7 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
             row = torch.zeros(self.num_envs, dtype=torch.int64, device="cpu")
             self._only(start, lambda: self.rows.set_streams(torch.from_numpy(self._seeds), row))
 
-    def _seeds_of(self, seed: int | Sequence[int | None] | None) -> tuple[int | None, ...]:
+    def _spread_seed(self, seed: int | Sequence[int | None] | None) -> tuple[int | None, ...]:
         """A seed or None for every row, from what `reset` is given."""
         seeds: Any = (None,) * self.num_envs if seed is None else as_tuple(seed)
         if isinstance(seed, int) and is_int(seed, 0):

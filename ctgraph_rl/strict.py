@@ -386,7 +386,7 @@ def _entries(folder: Path) -> list[os.DirEntry[str]]:
         return []
 
 
-def size_of(path: Path) -> int:
+def measure_size(path: Path) -> int:
     """Return the bytes of a regular file.
 
     Raises:
@@ -403,7 +403,7 @@ def blocks_of(path: Path, most: int) -> Iterator[bytes]:
     Raises:
         ValueError: for one of more than ``most`` bytes.
     """
-    size = size_of(path)
+    size = measure_size(path)
     require((size <= most, f"{path} has {size:,} bytes, the limit is {most:,}"))
     with path.open("rb") as file:
         while part := file.read(2**20):

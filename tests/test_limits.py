@@ -121,9 +121,9 @@ def test_what_agents_save_is_read_as_it_was():
 
 
 READ_BOTH = """
-from ctgraph_rl.log.saved import content_of, read_plain
+from ctgraph_rl.log.saved import read_content, read_plain
 from ctgraph_rl.runs.checkpoints import decoded
-for read, name in ((lambda path: read_plain(content_of(path)), "agent.pt"), (decoded, "64.pt")):
+for read, name in ((lambda path: read_plain(read_content(path)), "agent.pt"), (decoded, "64.pt")):
     try:
         read(Path(sys.argv[1]) / name)
     except ValueError as error:

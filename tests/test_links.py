@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from helpers.architecture import PACKAGES, sources_of
+from helpers.architecture import PACKAGES, find_sources
 from helpers.made_runs import write_run
 from helpers.reference_files import SHIPPED_2023
 from helpers.stopped_runs import learn_into, stopped_run
@@ -78,7 +78,7 @@ def writes(call: ast.Call) -> bool:
 
 
 def test_files_are_written_in_one_module():
-    sources = sources_of(*PACKAGES)
+    sources = find_sources(*PACKAGES)
     found = {(name, call) for name, source in sources.items() for call in writing_calls(source)}
 
     assert {each for each in found if each[0] != "ctgraph_rl.disk"} == set(ALLOWED)

@@ -78,11 +78,11 @@ class AMRL(Cell):
             first = torch.maximum(state[0].unsqueeze(1), x[:, :1])
             largest = max_scan(torch.cat([first, x[:, 1:].relu()], dim=1), starts)
             straight = _sums(x, starts, state[0]) if self.straight_through else largest
-            return _with_gradient_of(straight, largest), (largest[:, -1],)
+            return _borrow_gradient(straight, largest), (largest[:, -1],)
         sums = _sums(x, starts, state[0])
         counts = _sums(torch.ones_like(x[..., :1]), starts, state[1])
         mean = sums / counts
-        return _with_gradient_of(sums if self.straight_through else mean, mean), (sums[:, -1], counts[:, -1])
+        return _borrow_gradient(sums if self.straight_through else mean, mean), (sums[:, -1], counts[:, -1])
 
     def _output(self, aggregate: Tensor, y: Tensor) -> Tensor:
         return self.linear(torch.cat([y, aggregate], dim=-1)).relu()
@@ -94,6 +94,6 @@ def _sums(inputs: Tensor, starts: Tensor, state: Tensor) -> Tensor:
     return linear_scan((~starts).unsqueeze(-1).to(inputs.dtype), inputs)
 
 
-def _with_gradient_of(other: Tensor, values: Tensor) -> Tensor:
+def _borrow_gradient(other: Tensor, values: Tensor) -> Tensor:
     """Return values with the gradient of others."""
     return values if other is values else values.detach() + (other - other.detach())

@@ -16,7 +16,15 @@ import math
 import torch
 from torch import Tensor, nn
 
-from baselines.cells.cell import Cell, CellOutput, CellState, episodes_of, linear_layer, of_frames, zeros_like_weights
+from baselines.cells.cell import (
+    Cell,
+    CellOutput,
+    CellState,
+    linear_layer,
+    number_episodes,
+    of_frames,
+    zeros_like_weights,
+)
 from baselines.cells.frames import checked_frames
 from ctgraph_rl.checks import at_least_one, require
 
@@ -80,7 +88,7 @@ class Attention(Cell):
         """See `Cell`; all steps at once, each over the frames of its episode."""
         present = of_frames(inputs, groups)
         frames = torch.cat([state[0][..., :-1], present], dim=1)
-        episode = episodes_of(starts)
+        episode = number_episodes(starts)
         earlier = torch.where(state[0][..., -1] > 0, 0, -1)
         of_frame = torch.cat([earlier, episode], dim=1)
         return self._block(frames, groups.shape[1], of_frame.unsqueeze(1) == episode.unsqueeze(2))

@@ -125,7 +125,7 @@ def of_frames(values: Tensor, groups: Tensor) -> Tensor:
     return values.index_select(0, groups.flatten()).unflatten(0, groups.shape)
 
 
-def episodes_of(starts: Tensor) -> Tensor:
+def number_episodes(starts: Tensor) -> Tensor:
     """Number the episodes of rows from 0, int64 [rows, steps], by where others than the first start."""
     return torch.cat([starts[:, :1] & False, starts[:, 1:]], dim=1).cumsum(dim=1)
 

@@ -8,7 +8,15 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from baselines.cells.cell import Cell, CellOutput, CellState, episodes_of, linear_layer, of_frames, zeros_like_weights
+from baselines.cells.cell import (
+    Cell,
+    CellOutput,
+    CellState,
+    linear_layer,
+    number_episodes,
+    of_frames,
+    zeros_like_weights,
+)
 from ctgraph_rl.checks import at_most, is_int, require
 
 MOST_FRAMES = 1000
@@ -57,7 +65,7 @@ class Frames(Cell):
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
         """See `Cell`; a frame counts if no episode has started since."""
         frames = torch.cat([state[0], of_frames(inputs, groups)], dim=1)
-        episode = episodes_of(starts)
+        episode = number_episodes(starts)
         of_frame = torch.cat([episode.new_zeros(len(starts), self.num_frames - 1), episode], dim=1)
         windows = frames.unfold(1, self.num_frames, 1).transpose(2, 3)
         same = of_frame.unfold(1, self.num_frames, 1) == episode.unsqueeze(-1)

@@ -136,7 +136,7 @@ class AMD(Detector):
         steps = torch.cat([self.pending, new])
         full = len(steps) // self.window * self.window
         self.pending = steps[full:].clone()
-        label = self._label_of(steps[:full].view(-1, self.window, 3)) if full else self.label
+        label = self._fit_label(steps[:full].view(-1, self.window, 3)) if full else self.label
         if label == self.label:
             self.is_doubted = False
             self._learn(new)
@@ -181,7 +181,7 @@ class AMD(Detector):
         counts = counts.unflatten(-1, (self.num_actions, self.num_observations))
         return counts / counts.sum(dim=-1, keepdim=True)
 
-    def _label_of(self, windows: Tensor) -> int:
+    def _fit_label(self, windows: Tensor) -> int:
         """Return the label that fits windows of steps, int64 [W, window, 3], by its smallest p-value times W."""
         if self.models[self.label].total < self.num_untested:
             return self.label

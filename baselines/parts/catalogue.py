@@ -72,7 +72,7 @@ def catalogue(group: str, config_dir: Path | None = None) -> Iterator[CatalogueE
 def constants(target: str) -> NamedValues:
     """Return what the body of a class of `baselines`, or of one of its bases there, sets to constants."""
     module, _, name = target.rpartition(".")
-    tree = _tree_of(module)
+    tree = _parse_module(module)
     classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
     homes = dict(_imported(tree)) | dict.fromkeys(classes, module)
     found: NamedValues = {}
@@ -83,7 +83,7 @@ def constants(target: str) -> NamedValues:
     return found | dict(_assigned(classes[name]))
 
 
-def _tree_of(module: str) -> ast.Module:
+def _parse_module(module: str) -> ast.Module:
     return ast.parse(ROOT.joinpath(*module.split(".")).with_suffix(".py").read_text(encoding="utf-8"))
 
 

@@ -187,12 +187,12 @@ def parts_of(optimiser: torch.optim.Optimizer) -> Parts | torch.optim.Optimizer:
         return optimiser
     [group] = optimiser.param_groups
     parameters: list[Tensor] = list(group["params"])
-    state = [_state_of(optimiser, parameter, bool(group.get("fused"))) for parameter in parameters]
+    state = [_prepare_state(optimiser, parameter, bool(group.get("fused"))) for parameter in parameters]
     settings = {key: value for key, value in group.items() if key != "params"}
     return Parts(type(optimiser) is torch.optim.Adam, settings, parameters, state)
 
 
-def _state_of(optimiser: torch.optim.Optimizer, parameter: Tensor, fused: bool) -> TensorsByName:
+def _prepare_state(optimiser: torch.optim.Optimizer, parameter: Tensor, fused: bool) -> TensorsByName:
     """Return the state of a parameter, as PyTorch makes it; on a GPU the number of steps is there for CUDA graphs."""
     state = optimiser.state[parameter]
     if not state:

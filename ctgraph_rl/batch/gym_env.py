@@ -300,11 +300,11 @@ def _repeats_rule(task: GymTask) -> Rule:
         return True, ""
     first = task.make()
     other = task.make()
-    same = _episode_of(first) == _episode_of(first) == _episode_of(other)
+    same = _play_probe(first) == _play_probe(first) == _play_probe(other)
     return same, f"an episode of {task.id} must repeat with its seed and actions, and it does not: {FIX}"
 
 
-def _episode_of(env: Any) -> list[bytes]:
+def _play_probe(env: Any) -> list[bytes]:
     """Return what an episode of random actions shows."""
     env.action_space.seed(0)
     shown = [np.asarray(env.reset(seed=0)[0]).tobytes()]

@@ -14,7 +14,7 @@ from ctgraph_rl.checks import require, require_memory
 from ctgraph_rl.core import reading
 from ctgraph_rl.core.graph import MAX_STATES, StateType
 from ctgraph_rl.core.rewards import RewardFn
-from ctgraph_rl.core.rotation import taps_of
+from ctgraph_rl.core.rotation import compute_taps
 from ctgraph_rl.core.row_params import LegacyIndex, ObservationParams, RewardParams, Uses
 from ctgraph_rl.core.tree import Swap, TreeParams, tree_params
 from ctgraph_rl.tasks.images import white_level
@@ -158,7 +158,7 @@ def _observation_params(tasks: _Different, bank: Bank) -> ObservationParams:
 
 def _taps(size: int, angles: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Return what rotates an image of a size by each angle."""
-    index, weight = zip(*(taps_of(size, angle) for angle in range(angles)), strict=True)
+    index, weight = zip(*(compute_taps(size, angle) for angle in range(angles)), strict=True)
     return torch.stack(index).to(device), torch.stack(weight).to(device)
 
 

@@ -28,7 +28,7 @@ from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CURRICULUM, FAILURE, LOG, METRICS, MOST_BYTES_OF_A_REASON
 from ctgraph_rl.log.provenance import machine, numbers_of, versions
 from ctgraph_rl.log.run_log import RunLog
-from ctgraph_rl.log.saved import content_of, num_bytes_of, read_plain, sum_of_state
+from ctgraph_rl.log.saved import count_bytes, read_content, read_plain, sum_of_state
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.parsers import LEVELS
 from ctgraph_rl.portable import VARIABLES, cpu_model
@@ -222,8 +222,8 @@ def result_of(cell: RerunCell, seed: int, outcome: Outcome) -> Rerun:
             return _failed(run_dir, outcome)
         log = RunLog.read(run_dir / LOG)
         has_agent = (run_dir / AGENT).exists()
-        state = read_plain(content_of(run_dir / AGENT)) if has_agent else None
-        agent, size = (sum_of_state(state), num_bytes_of(state)) if has_agent else ("", None)
+        state = read_plain(read_content(run_dir / AGENT)) if has_agent else None
+        agent, size = (sum_of_state(state), count_bytes(state)) if has_agent else ("", None)
         return Rerun(log, agent, None, size, _experts(cell.folder.resolve(), log))
     except (ValueError, OSError) as error:
         return Rerun(None, "", str(error))

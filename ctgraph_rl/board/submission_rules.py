@@ -16,7 +16,7 @@ from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule
 from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.escape import listed
 from ctgraph_rl.log.provenance import NUMBERS, code_changes
-from ctgraph_rl.log.sources import SCRIPTS, sources_of
+from ctgraph_rl.log.sources import SCRIPTS, find_sources
 from ctgraph_rl.packages import class_named, is_published
 from ctgraph_rl.runs.load import OURS
 from ctgraph_rl.runs.read import MODIFIED, Run
@@ -133,7 +133,7 @@ def code_rules(runs: Sequence[Run]) -> Iterator[Rule]:
 def _code_now(about: ReadOnlyValues) -> NamedValues:
     """Return the code of this process, as far as a run's log names its parts; None for what cannot be found."""
     stored = about.get("sources") or {}
-    found = sources_of(stored.keys() - {*SCRIPTS})
+    found = find_sources(stored.keys() - {*SCRIPTS})
     sources = {**dict.fromkeys(stored), **found} if about.get("sources") is not None else None
     return {"fingerprint": about["fingerprint"], "numbers": NUMBERS, "sources": sources}
 

@@ -46,7 +46,7 @@ from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG
 from ctgraph_rl.log.provenance import machine
 from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.log.run_log import RunLog
-from ctgraph_rl.log.saved import content_of, num_bytes_of, read_plain, sum_of_state
+from ctgraph_rl.log.saved import count_bytes, read_content, read_plain, sum_of_state
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.log.tables import evaluations_parquet, require_parquet
 from ctgraph_rl.metrics import Metric
@@ -170,7 +170,7 @@ def _line(run: Run, name: str, reasons: Mapping[int, str]) -> SubmittedRun:
         reason="" if finished else one_line(reasons[run.seed]),
         group=tuple(run.about.get("together") or ()),
         agent_sha256="" if state is None else sum_of_state(state),
-        agent_bytes=None if state is None else num_bytes_of(state),
+        agent_bytes=None if state is None else count_bytes(state),
         log_sha256=log_sum(log),
         machine=str(run.about.get("machine", "")),
         num_threads=int(run.about.get("num_threads", 1)),
@@ -182,7 +182,7 @@ def _line(run: Run, name: str, reasons: Mapping[int, str]) -> SubmittedRun:
 def _state(path: Path) -> Any:
     """Return what an agent saved."""
     try:
-        return read_plain(content_of(path))
+        return read_plain(read_content(path))
     except ValueError as error:
         raise ValueError(f"{path} {error}: save a state_dict there, or nothing") from error
 

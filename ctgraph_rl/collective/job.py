@@ -19,7 +19,7 @@ from ctgraph_rl.disk import made_folder
 from ctgraph_rl.learn.collective import ExchangeLike, Member, learn_collective
 from ctgraph_rl.learn.progress import ProgressBar
 from ctgraph_rl.log.escape import terminal_text
-from ctgraph_rl.log.files import CHECKPOINTS, METRICS, locked, member_folder, members_of
+from ctgraph_rl.log.files import CHECKPOINTS, METRICS, list_members, locked, member_folder
 from ctgraph_rl.log.provenance import code_changes, versions
 from ctgraph_rl.log.run_log import SCHEMA, RunLog
 from ctgraph_rl.report.objective import check_objective, objective_of
@@ -72,7 +72,7 @@ def value_of(cfg: Any, run_dir: Path, run_dirs: Sequence[Path]) -> float:
     Raises:
         ValueError: if a run has no value; says why.
     """
-    return objective_of(cfg.objective, run_dirs or members_of(run_dir))
+    return objective_of(cfg.objective, run_dirs or list_members(run_dir))
 
 
 def run_collective(cfg: Any, run_dir: Path) -> None:

@@ -131,7 +131,7 @@ def turn(images: Tensor, angle: Tensor, taps: tuple[Tensor, Tensor]) -> Tensor:
     Args:
         images: uint8 [N, 1, r, r].
         angle: int64, whole degrees in [0, A).
-        taps: `rotation.taps_of` A angles, int64 [A, r * r, 4] each.
+        taps: `rotation.compute_taps` A angles, int64 [A, r * r, 4] each.
 
     Returns:
         uint8 [N, 1, r, r].

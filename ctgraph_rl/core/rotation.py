@@ -23,13 +23,13 @@ def rotate(images: Tensor, degrees: int) -> Tensor:
     """
     if degrees % 360 == 0:
         return images
-    index, weight = taps_of(images.shape[-1], degrees)
+    index, weight = compute_taps(images.shape[-1], degrees)
     taps = images.flatten(1).to(torch.int64)[:, index]
     return (((taps * weight).sum(-1) + (1 << 15)) >> 16).to(torch.uint8).view_as(images)
 
 
 @lru_cache(maxsize=512)
-def taps_of(size: int, degrees: int) -> tuple[Tensor, Tensor]:
+def compute_taps(size: int, degrees: int) -> tuple[Tensor, Tensor]:
     """For each pixel the four source pixels and their weights * 2**16; both int64 [r * r, 4]."""
     angle = math.radians(degrees)
     centre = (size - 1) / 2

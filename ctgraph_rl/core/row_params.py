@@ -43,7 +43,7 @@ class ObservationParams(NamedTuple):
     white: Tensor  # float64: brightness of the cue for the goal's reward
     noise_start: Tensor  # first row of the noise bank with the row's noise
     legacy: LegacyIndex | None = None
-    taps: tuple[Tensor, Tensor] | None = None  # of `num_angles` rotations, see `rotation.taps_of`
+    taps: tuple[Tensor, Tensor] | None = None  # of `num_angles` rotations, see `rotation.compute_taps`
 
 
 class RewardParams(NamedTuple):

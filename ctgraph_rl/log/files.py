@@ -41,7 +41,7 @@ def member_folder(folder: Path, number: int) -> Path:
     return folder / f"member_{number:03d}"
 
 
-def members_of(folder: Path) -> list[Path]:
+def list_members(folder: Path) -> list[Path]:
     """Return the run directories of a collective's members."""
     return sorted(folder.glob("member_*"))
 

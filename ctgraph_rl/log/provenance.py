@@ -15,7 +15,7 @@ import torchrl
 from ctgraph_rl import __version__
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues
 from ctgraph_rl.log.run_log import SCHEMA
-from ctgraph_rl.log.sources import full_name, is_ours, sources_of, targets
+from ctgraph_rl.log.sources import find_sources, full_name, is_ours, targets
 from ctgraph_rl.packages import is_published
 from ctgraph_rl.portable import cpu_model, is_portable
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -76,7 +76,7 @@ def code(curriculum: Curriculum, names: Iterable[str] | None = ()) -> NamedValue
         names: classes and functions that learn, such as ``my_agent.MyAgent``, of which the user's sources count; None
             if they are not known.
     """
-    known = None if names is None else sources_of([*names, *dict.fromkeys(_parts(curriculum))])
+    known = None if names is None else find_sources([*names, *dict.fromkeys(_parts(curriculum))])
     return {"fingerprint": curriculum.fingerprint, "numbers": NUMBERS, "sources": known}
 
 

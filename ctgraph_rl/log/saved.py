@@ -32,7 +32,7 @@ _FOLLOWS = {"_codecs encode": "BINUNICODE", "collections OrderedDict": "EMPTY_TU
 """What these are called with, so that no result is made larger again and again."""
 
 
-def content_of(path: Path) -> bytes:
+def read_content(path: Path) -> bytes:
     """Return the content of a regular file that fits this machine.
 
     Raises:
@@ -91,16 +91,16 @@ def sum_of_state(state: Any) -> str:
     for name, value in sorted(_leaves(state), key=itemgetter(0)):
         found.update(f"{name}\n{_described(value)}\n".encode("utf-8", "backslashreplace"))
         if isinstance(value, torch.Tensor):
-            found.update(bits_of(value).numpy().tobytes())
+            found.update(view_bits(value).numpy().tobytes())
     return found.hexdigest()
 
 
-def num_bytes_of(state: Any) -> int:
+def count_bytes(state: Any) -> int:
     """Return the bytes of all tensors of a state."""
     return sum(value.nbytes for _, value in _leaves(state) if isinstance(value, torch.Tensor))
 
 
-def bits_of(tensor: torch.Tensor) -> torch.Tensor:
+def view_bits(tensor: torch.Tensor) -> torch.Tensor:
     """Return the bytes of a tensor, uint8 [bytes], on the CPU."""
     return tensor.detach().cpu().contiguous().view(-1).view(torch.uint8)
 

@@ -54,7 +54,7 @@ _READ: dict[str, tuple[ModuleSpec, Module]] = {}
 that runs."""
 
 
-def sources_of(names: Iterable[str]) -> dict[str, str | None]:
+def find_sources(names: Iterable[str]) -> dict[str, str | None]:
     """Return the digest of each module of the user that some classes or functions need, by the module's name.
 
     An installed package that one of them is of has its version instead; None stands for what cannot be read, such as a

@@ -21,7 +21,7 @@ import torch
 
 from ctgraph_rl.checks import as_path, is_int, not_negative, require, true_or_false
 from ctgraph_rl.disk import PART, made_folder, require_no_link, sync_folder, write_whole
-from ctgraph_rl.log.saved import content_of, read_plain
+from ctgraph_rl.log.saved import read_content, read_plain
 from ctgraph_rl.log.sums import sum_of
 from ctgraph_rl.runs.interrupt import Interrupt
 
@@ -209,7 +209,7 @@ def decoded(path: Path) -> RunState:
     """
     advice = "delete it to resume from the one before"
     try:
-        head, _, content = content_of(path).partition(b"\n")
+        head, _, content = read_content(path).partition(b"\n")
     except ValueError as error:
         raise BrokenCheckpoint(f"{error}; {advice}") from None
     try:

@@ -21,7 +21,7 @@ from ctgraph_rl.learn.labels import policies_by_label
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG
 from ctgraph_rl.log.run_log import RunLog
-from ctgraph_rl.log.saved import content_of, read_plain, require_records
+from ctgraph_rl.log.saved import read_content, read_plain, require_records
 from ctgraph_rl.packages import class_named
 from ctgraph_rl.runs.checkpoints import Checkpoints
 from ctgraph_rl.runs.settings import parameters_of, with_added
@@ -196,7 +196,7 @@ def _weights(run_dir: Path, log: RunLog) -> tuple[ReadOnlyValues, int]:
 def _checked(path: Path) -> Any:
     """Return what a file of `torch.save` holds, if its own sums agree and it is plain."""
     try:
-        content = content_of(path)
+        content = read_content(path)
         require_records(content)
         with zipfile.ZipFile(io.BytesIO(content)) as records:
             changed = records.testzip()

@@ -126,7 +126,7 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "baselines.parts.networks",
             "baselines.parts.inner_loop:InnerModel,Episodes,Played",
             "baselines.parts.gates:GatedNetwork",
-            "baselines.update.update:UpdateState,update,Parts,make_optimiser,has_parts,parts_of,step",
+            "baselines.update.update:UpdateState,update,Parts,make_optimiser,has_parts,parts_of,minimise,step",
             "baselines.parts.embedding",
             "baselines.parts.transport",
             "baselines.methods.method",

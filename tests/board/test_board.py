@@ -18,7 +18,7 @@ from ctgraph_rl import cli
 from ctgraph_rl.board import verify
 from ctgraph_rl.board.rescore import Check, rescore
 from ctgraph_rl.board.standings.board_page import write_board
-from ctgraph_rl.board.standings.entries import FIELDS, entry_of, read_entries, verification_of
+from ctgraph_rl.board.standings.entries import FIELDS, make_entry, read_entries, verification_of
 from ctgraph_rl.board.submission import VERIFICATION, read_submission
 
 for package in ("jinja2", "scipy", "pyarrow"):
@@ -34,7 +34,7 @@ def board(tiny_home, submission, tmp_path):
 
 
 def test_an_entry_has_the_numbers_of_its_submission(submission):
-    found = entry_of(submission)
+    found = make_entry(submission)
 
     assert (found.name, found.level, found.why_not_ranked) == ("Tiny PPO", "submitted", None)
     assert found.scores == tuple(
@@ -201,7 +201,7 @@ def test_without_a_submission_there_is_no_board(tmp_path):
 
 def test_a_submission_for_no_track_is_left_out_and_named(submission):
     with pytest.raises(ValueError, match="is for no track: name one in"):
-        entry_of(replace(submission, track=None))
+        make_entry(replace(submission, track=None))
 
 
 @pytest.mark.slow

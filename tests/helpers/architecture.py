@@ -276,7 +276,7 @@ def _sizes_of_functions(tree: ast.Module, text: str) -> list[tuple[str, int]]:
     return sizes
 
 
-def sources_of(*folders: str, root: Path = CHECKOUT) -> dict[str, str]:
+def find_sources(*folders: str, root: Path = CHECKOUT) -> dict[str, str]:
     """Source texts of the checkout by the names of their modules, which begin at a root."""
     paths = sorted(path for folder in folders for path in (root / folder).rglob("*.py"))
     return {".".join(path.relative_to(root).with_suffix("").parts): path.read_text("utf-8") for path in paths}
@@ -285,19 +285,19 @@ def sources_of(*folders: str, root: Path = CHECKOUT) -> dict[str, str]:
 @cache
 def modules_of_packages() -> list[Module]:
     """The modules of our packages."""
-    return read(sources_of(*PACKAGES))
+    return read(find_sources(*PACKAGES))
 
 
 @cache
 def modules_of_results() -> list[Module]:
     """The modules of the pages of results: the command and its studies."""
-    return read(sources_of(".", root=RESULTS))
+    return read(find_sources(".", root=RESULTS))
 
 
 @cache
 def modules_of_tests() -> list[Module]:
     """The modules of the tests, without the bodies of their functions."""
-    return read(sources_of("tests"), with_bodies=False)
+    return read(find_sources("tests"), with_bodies=False)
 
 
 # The rules

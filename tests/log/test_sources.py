@@ -14,7 +14,7 @@ from zipfile import ZipFile
 import pytest
 
 import ctgraph_rl.log.sources
-from ctgraph_rl.log.sources import read_module, sources_of, syntax, targets
+from ctgraph_rl.log.sources import find_sources, read_module, syntax, targets
 
 EVERYTHING = '''
 """A module with the syntax whose trees differ between versions of Python."""
@@ -129,7 +129,7 @@ def test_the_users_modules_count_with_all_that_they_import(write):
         mine_package__in__unused="",
     )
 
-    found = sources_of(["mine.Agent", "baselines.ppo.PPO", "torch.optim.Adam", "functools.partial"])
+    found = find_sources(["mine.Agent", "baselines.ppo.PPO", "torch.optim.Adam", "functools.partial"])
 
     inner = [f"mine_package.{name}" for name in ("beside", "deep", "inner")]
     assert list(found) == ["mine", "mine_a", "mine_b", "mine_c", "mine_package", *inner]
@@ -138,11 +138,11 @@ def test_the_users_modules_count_with_all_that_they_import(write):
 
 def test_an_edit_of_an_imported_module_changes_its_digest_alone(write):
     write(mine="from mine_a import *", mine_a="x = 1")
-    before = sources_of(["mine.Agent"])
+    before = find_sources(["mine.Agent"])
 
     write(mine_a="x = 2")
 
-    after = sources_of(["mine.Agent"])
+    after = find_sources(["mine.Agent"])
     assert {name for name in after if after[name] != before[name]} == {"mine_a"}
 
 
@@ -150,23 +150,23 @@ def test_an_edit_does_not_change_what_this_process_has_imported(write, tmp_path)
     write(mine="x = 1")
     import mine  # type: ignore[import-not-found]
 
-    before = sources_of(["mine.Agent"])
+    before = find_sources(["mine.Agent"])
     (tmp_path / "mine.py").write_text("x = 2")
 
-    assert mine.x == 1 and sources_of(["mine.Agent"]) == before
+    assert mine.x == 1 and find_sources(["mine.Agent"]) == before
     write()
-    assert sources_of(["mine.Agent"]) != before
+    assert find_sources(["mine.Agent"]) != before
 
 
 def test_an_installed_package_counts_by_its_version():
-    assert sources_of(["rich.console.Console"])["rich"].startswith("version ")
-    assert sources_of(["yaml.Loader"])["yaml"].startswith("version "), "another name than that of what is installed"
+    assert find_sources(["rich.console.Console"])["rich"].startswith("version ")
+    assert find_sources(["yaml.Loader"])["yaml"].startswith("version "), "another name than that of what is installed"
 
 
 def test_what_cannot_be_read_is_unknown(monkeypatch):
     monkeypatch.delattr(sys.modules["__main__"], "__file__", raising=False)
 
-    assert sources_of(["__main__.Agent"]) == {"__main__": None}
+    assert find_sources(["__main__.Agent"]) == {"__main__": None}
 
 
 @pytest.mark.parametrize("name", ["made_by_hand.Agent", "removed.Agent", "archived.Agent", "__mp_main__.NoSuchClass"])
@@ -181,20 +181,20 @@ def test_what_has_no_file_is_unknown(name, write, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path / "archive.zip")
     monkeypatch.setattr(sys.modules["__main__"], "__file__", __file__, raising=False)
 
-    assert list(sources_of([name]).values()) == [None]
+    assert list(find_sources([name]).values()) == [None]
 
 
 def test_packages_without_init_within_others_are_found_without_their_import(write):
     write(mine__in__deep__in__agent="def f():\n    import mine.other.part", mine__in__other__in__part="")
 
-    assert list(sources_of(["mine.deep.agent.Agent"])) == ["mine.deep.agent", "mine.other.part"]
+    assert list(find_sources(["mine.deep.agent.Agent"])) == ["mine.deep.agent", "mine.other.part"]
 
 
 def test_modules_that_are_imported_by_a_relative_name_or_a_keyword_count(write):
     imports = "from importlib import import_module as i\nimport importlib as l\nl.import_module('.a', 'mine')"
     write(mine__in____init__=f"{imports}\nl.import_module(name='mine_b')", mine__in__a="", mine_b="")
 
-    assert list(sources_of(["mine.Agent"])) == ["mine", "mine.a", "mine_b"]
+    assert list(find_sources(["mine.Agent"])) == ["mine", "mine.a", "mine_b"]
 
 
 @pytest.mark.parametrize("change", ["Agent.size = 2", "WIDTHS['x'] = 2", "Agent.net.sizes[0] = 2"])
@@ -204,7 +204,7 @@ def test_attributes_and_items_that_a_script_sets_count(change, tmp_path, monkeyp
     found = []
     for more in ("", "Other.size = 2\n", change):
         script.write_text(f"WIDTHS = {{}}\nclass Agent:\n    net = WIDTHS\nclass Other: ...\n{more}")
-        found.append(sources_of(["__main__.Agent"]))
+        found.append(find_sources(["__main__.Agent"]))
 
     assert found[0] == found[1] != found[2]
 
@@ -220,8 +220,8 @@ def test_of_a_script_what_a_class_needs_counts(tmp_path, write):
         def width(): return SIZE + helper.x
         class Agent:
             size = width()
-        from ctgraph_rl.log.sources import sources_of, full_name
-        print(json.dumps(sources_of([full_name(Agent)])))
+        from ctgraph_rl.log.sources import find_sources, full_name
+        print(json.dumps(find_sources([full_name(Agent)])))
     """
 
     def run(seed: int, size: int) -> dict[str, str]:

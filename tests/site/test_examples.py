@@ -7,14 +7,14 @@ from collections.abc import Iterator
 from importlib import import_module
 
 import pytest
-from helpers.architecture import PACKAGES, sources_of
+from helpers.architecture import PACKAGES, find_sources
 
 OPTIONS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
 
 def examples() -> Iterator[doctest.DocTest]:
     """Every docstring of the packages with an example, each once."""
-    for name, source in sources_of(*PACKAGES).items():
+    for name, source in find_sources(*PACKAGES).items():
         if ">>> " in source:
             found = doctest.DocTestFinder(exclude_empty=True).find(import_module(name))
             yield from (each for each in found if each.examples)

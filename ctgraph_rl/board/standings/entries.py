@@ -142,7 +142,7 @@ def read_entries(paths: Iterable[Path | str], config_dir: Path | None = None) ->
             problems.append(Problem(path, f"{path} holds no submission: ctgraph-rl submit RUNS --to DIR makes one"))
         for folder in folders:
             try:
-                entry = entry_of(read_submission(folder, config_dir=config_dir))
+                entry = make_entry(read_submission(folder, config_dir=config_dir))
             except Exception as error:  # a broken submission is never an end for others
                 problems.append(Problem(folder, f"{folder}: {one_line_of(error, folder)}"))
                 continue
@@ -153,7 +153,7 @@ def read_entries(paths: Iterable[Path | str], config_dir: Path | None = None) ->
     return list(found.values()), problems
 
 
-def entry_of(submission: Submission) -> BoardEntry:
+def make_entry(submission: Submission) -> BoardEntry:
     """Return a submission as an entry.
 
     Raises:

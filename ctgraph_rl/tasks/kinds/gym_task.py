@@ -61,7 +61,7 @@ class GymTask:
         make_fields_plain(self)
         object.__setattr__(self, "kwargs", _frozen_kwargs(self.kwargs))
         wrappers = as_tuple(self.wrappers)
-        wrappers = tuple(map(_name_of, wrappers)) if isinstance(wrappers, tuple) else wrappers
+        wrappers = tuple(map(_import_name, wrappers)) if isinstance(wrappers, tuple) else wrappers
         object.__setattr__(self, "wrappers", wrappers)
         object.__setattr__(self, "return_range", as_tuple(self.return_range))
         names = isinstance(wrappers, tuple) and all(isinstance(each, str) and ":" in each for each in wrappers)
@@ -241,7 +241,7 @@ def _is_plain(value: Any) -> bool:
     return value is None or isinstance(value, (bool, int, float, str))
 
 
-def _name_of(wrapper: Any) -> Any:
+def _import_name(wrapper: Any) -> Any:
     """Return ``module:name`` of a class or function; anything else unchanged."""
     named = callable(wrapper) and hasattr(wrapper, "__qualname__")
     return f"{wrapper.__module__}:{wrapper.__qualname__}" if named else wrapper

@@ -72,7 +72,7 @@ def test_clusters_are_those_of_dbscan():
 @pytest.mark.parametrize(("found", "left"), [(0, 10), (1, 0)])
 def test_steps_in_no_window_yet_are_forgotten_at_a_doubt_and_by_a_new_label(found, left, monkeypatch):
     detector = amd(window=30)
-    monkeypatch.setattr(detector, "_label_of", lambda windows: found)
+    monkeypatch.setattr(detector, "_fit_label", lambda windows: found)
 
     assert detector.observe(independent(1, [0.5, 0.3, 0.2], 0)) is None
     assert (detector.is_doubted, len(detector.pending)) == (found == 1, left)
@@ -153,7 +153,7 @@ def test_the_smallest_p_value_of_a_batch_counts_times_its_windows(monkeypatch):
     detector, windows = amd(num_untested=0), torch.zeros(12, 40, 3)
     monkeypatch.setattr(detector, "p_values", lambda label, windows: torch.full((len(windows),), 0.002))
 
-    assert [detector._label_of(windows[:number]) for number in (4, 5, 12)] == [1, 0, 0]
+    assert [detector._fit_label(windows[:number]) for number in (4, 5, 12)] == [1, 0, 0]
 
 
 def test_the_best_label_is_taken_at_once_only_as_published():
