@@ -450,18 +450,23 @@ def test_what_nothing_can_adapt_to_is_refused_before_any_work():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "least"), [("cavia", 0.95), ("maml", 0.85)])
-def test_at_depth_1_the_goal_is_reached_after_one_step(name, least):
-    """Episodes with one return say nothing, so that k of them before the step allow 1 - 2^-k at most after it."""
-    how = Evaluation(160, greedy=False, before=False, episodes_per_row=4, adapt_episodes=10)
-    curriculum = replace(CURRICULUM, blocks=(Block((ONE, TWO), 96_000),), evaluation=how)
-    settings = {"adapt_episodes": 10, "num_steps": 160, "num_envs": 40, "hidden_size": 32}
-    agent = new_agent(curriculum, partial(MAKE[name], **{**settings, "inner_rate": 1.0, "max_kl": 0.05}), 0)
+@pytest.mark.parametrize(("name", "hidden_size", "batches"), [("cavia", 64, 12), ("maml", 32, 11)])
+def test_at_depth_1_the_goal_is_reached_after_one_step(name, hidden_size, batches):
+    """With PPO and gamma=1, where returns of episodes that succeed are equal, so that A is 0 where all do.
+
+    Episodes with one return say nothing, so that k of them before the step allow 1 - 2^-k at most after it. Both
+    can fall again if they go on: MAML with seed 0 from 0.99 after 10 batches to 0.65 after 16.
+    """
+    how = Evaluation(160, greedy=False, before=False, episodes_per_row=4, adapt_episodes=8)
+    curriculum = replace(CURRICULUM, blocks=(Block((ONE, TWO), batches * 9_600),), evaluation=how)
+    settings = {"adapt_episodes": 8, "num_steps": 96, "num_envs": 100, "hidden_size": hidden_size}
+    outer = {"outer": "ppo", "gamma": 1.0, "learning_rate": 0.005, "num_epochs": 5, "inner_rate": 1.0}
+    agent = new_agent(curriculum, partial(MAKE[name], **settings, **outer), 0)
     torch.manual_seed(0)
 
     log = learn_curriculum(curriculum, agent)
 
     steps = [line for line in log.measurements if line["kind"] == "adaptation"]
-    after = [line["return_mean"] for line in steps if line["step"] > 10]
+    after = [line["return_mean"] for line in steps if line["step"] > 8]
     assert len(after) == 2 * 4
-    assert sum(after) / len(after) >= least
+    assert sum(after) / len(after) >= 0.9
