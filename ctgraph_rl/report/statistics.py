@@ -6,7 +6,6 @@ There is one rule for each kind of number, and ``docs/explanation/statistics.md`
   bounds, has a width where all seeds agree, and is that of Clopper and Pearson for two outcomes at the bounds.
 - A mean of values without two known bounds: Student's interval, cut at a bound that is known.
 - A time: the interval of the median by order statistics, where a seed that never got there took infinitely long.
-- A number of two groups' means, such as forward transfer: both groups are weighted at random as in Gaffke's interval.
 
 Beside these are the numbers that other papers show: `mean` without bounds has Student's interval, `mean_and_std` the
 standard deviation, and `iqm` the interquartile mean of rliable.
@@ -18,7 +17,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from statistics import fmean, median
@@ -301,44 +300,6 @@ def interquartile_mean(
     low = min(limits[0], value)
     high = max(limits[1], value)
     return Estimate(value, low=low, high=high, n=n, n_undefined=undefined, method=method)
-
-
-def of_two_groups(
-    first: np.ndarray,
-    second: np.ndarray,
-    measure: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    bounds: LowHigh = (0.0, 1.0),
-    level: float = LEVEL,
-) -> Estimate:
-    """Return a number of the means of two groups of seeds, such as forward transfer, with the uncertainty of both.
-
-    The seeds of each group have random weights, and one more seed stands at the bound that makes the number small for
-    its lower limit, and large for its upper one: Gaffke's interval for two groups. Groups are weighted independently,
-    which is too wide rather than too narrow where seeds of both are alike.
-
-    Args:
-        first: what the number rises with, float64 [seeds, tasks].
-        second: what it falls with, float64 [other seeds, tasks].
-        measure: the number of two means, [..., tasks] and [..., tasks] to [...]; monotone, and may be infinite.
-        bounds: the lowest and the highest possible value of either group.
-        level: coverage of the interval.
-    """
-    require(*fraction(level=level))
-    lowest, highest, _ = _checked(bounds)
-    method = f"two groups, weighted {level:.0%}"
-    n = min(len(first), len(second))
-    value = float(measure(first.mean(0), second.mean(0)))
-    if n < 2:
-        return Estimate(value, None, None, n, 0, method=method, reason="one seed has no interval")
-    rng = np.random.default_rng(0)
-    limits = []
-    for ends, tail in (((lowest, highest), (1 - level) / 2), ((highest, lowest), (1 + level) / 2)):
-        means = []
-        for group, end in zip((first, second), ends, strict=True):
-            weights = rng.dirichlet(np.ones(len(group) + 1), RESAMPLES)
-            means.append(weights @ np.vstack([group, np.full(group.shape[1], end)]))
-        limits.append(float(np.quantile(measure(*means), tail, method="lower" if tail < 0.5 else "higher")))
-    return Estimate(value, low=limits[0], high=limits[1], n=n, n_undefined=0, method=method)
 
 
 @takes_numbers

@@ -19,7 +19,6 @@ from ctgraph_rl.report.statistics import (
     mean,
     mean_and_std,
     median_time,
-    of_two_groups,
     seeds_needed,
     solved_rate,
 )
@@ -173,25 +172,6 @@ def test_a_seed_that_never_got_there_is_no_seed_without_a_result():
 
     assert (estimate.n, estimate.n_undefined, estimate.value) == (2, 1, math.inf)
     assert estimate.reason == "the range of the times covers 50%"
-
-
-def gain(runs, experts):
-    """Continual World's forward transfer of mean areas."""
-    return ((runs - experts) / (1 - experts)).mean(-1)
-
-
-@pytest.mark.slow
-def test_a_number_of_two_groups_has_the_uncertainty_of_both():
-    runs, experts = np.array([[0.9], [0.8], [1.0], [0.9], [0.9]]), np.array([[0.5], [0.6], [0.4], [0.5], [0.5]])
-    certain = np.repeat(experts.mean(0, keepdims=True), 10_000, 0)
-
-    both, one = of_two_groups(runs, experts, gain), of_two_groups(runs, certain, gain)
-
-    assert both.value == one.value == pytest.approx(0.8)
-    assert both.low < one.low < 0.8 < one.high <= both.high <= 1
-    with np.errstate(divide="ignore"):
-        nothing_to_gain = of_two_groups(runs, np.array([[1.0], [1.0], [0.99], [1.0], [1.0]]), gain)
-    assert nothing_to_gain.low < -50
 
 
 def test_p_values_are_corrected_for_their_number():

@@ -18,6 +18,7 @@ from ctgraph_rl.report import statistics
 from ctgraph_rl.report.intervals import scipy
 from studies.lifelong.comparison import forward_transfer
 from studies.raw import HERE, TEMPLATES, table
+from studies.two_groups import two_groups
 
 PAGE = HERE.parent / "explanation" / "statistics.md"
 SEEDS = (3, 5, 10, 20)
@@ -147,7 +148,7 @@ def _mean_wait(mean: float) -> float:
 
 
 def _both(runs: np.ndarray, experts: np.ndarray) -> Interval:
-    found = statistics.of_two_groups(runs, experts, forward_transfer)
+    found = two_groups(runs, experts, forward_transfer)
     return found.low, found.high  # type: ignore[return-value]
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from studies.collectives import mosaic, selecting
 from studies.collectives.runs import BLOCKS, CELL, KEY, NAME
 from studies.raw import HERE, TEMPLATES, Raw, groups, machines, mean_of, numbers_in, read, shown, table
+from studies.two_groups import two_groups
 
 SEEDS = 5
 
@@ -102,10 +103,8 @@ def faster(num_members: str) -> Estimate:
     """Return by what factor a task is solved sooner than alone, with its interval."""
     import numpy as np
 
-    from ctgraph_rl.report import statistics
-
     alone, shared = (np.array(solving_times(number))[:, None] for number in ("1", num_members))
-    return statistics.of_two_groups(alone, shared, _ratio, (BATCH, float(FRAMES)))
+    return two_groups(alone, shared, _ratio, (BATCH, float(FRAMES)))
 
 
 def _ratio(first: Any, second: Any) -> Any:

@@ -13,10 +13,10 @@ import torch
 from ctgraph_rl import metrics
 from ctgraph_rl.metrics import METRICS, Curves
 from ctgraph_rl.metrics.bounds import Known
-from ctgraph_rl.report import statistics
 from studies.lifelong.experiments import MASKS, expected, missing
 from studies.lifelong.runs import EXPERT
 from studies.raw import Raw, groups, mean_of, read, shown, table
+from studies.two_groups import two_groups
 
 SOLVED = 0.9
 LEAST_ROOM = Fraction(1, 20)
@@ -78,7 +78,7 @@ def forward_transfer(runs: np.ndarray, experts: np.ndarray) -> np.ndarray:
 def transfer(runs: np.ndarray, experts: np.ndarray, left_out: Sequence[int]) -> str:
     """Forward transfer, with the uncertainty of both sides."""
     kept = [task for task in range(runs.shape[1]) if task + 1 not in left_out]
-    return shown(statistics.of_two_groups(runs[:, kept], experts[:, kept], forward_transfer, RETURNS))
+    return shown(two_groups(runs[:, kept], experts[:, kept], forward_transfer, RETURNS))
 
 
 OF_A_RUN = {
