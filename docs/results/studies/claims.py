@@ -8,6 +8,8 @@ from ctgraph_rl.report import statistics
 from ctgraph_rl.report.statistics import Comparison
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS
 from ctgraph_rl.tasks.values import open_loop_ceiling
+from studies import claim_runs
+from studies.claim_runs import above, below
 from studies.memory.conditions import GIVEN, Condition, finished
 from studies.memory.runs import AGENTS, returns, solved
 from studies.raw import HERE, TEMPLATES, Raw, machines, shown
@@ -30,7 +32,7 @@ FEW = "100"
 MANY = "500"
 AGREES = "agrees"
 NOT_FOUND = "not found"
-NOT_RUN = "not run yet"
+TRANSFER = "forward_transfer"
 
 
 def compared_sets() -> dict[tuple[Condition, str], tuple[Raw, Raw]]:
@@ -58,7 +60,6 @@ def large_sets() -> dict[str, str]:
     changes = {key: sum(solved(many)) - sum(solved(few)) for key, (few, many) in pairs.items()}
     lost, won = (sum(abs(each) for each in changes.values() if sign * each > 0) for sign in (-1, 1))
     found = of_large_sets().difference
-    worse = found.high is not None and found.high < 0
     return {
         "sets_few": str(sum(sum(solved(few)) for few, _ in pairs.values())),
         "sets_many": str(sum(sum(solved(many)) for _, many in pairs.values())),
@@ -67,7 +68,7 @@ def large_sets() -> dict[str, str]:
         "sets_lost": str(lost),
         "sets_won": str(won),
         "sets_worst": str(-min(changes.values())),
-        "sets_verdict": AGREES if worse else NOT_FOUND,
+        "sets_verdict": AGREES if below(found) else NOT_FOUND,
     }
 
 
@@ -85,7 +86,7 @@ def advantages() -> dict[str, str]:
     better = []
     for key, name in (("mohqa", "mohqa"), ("backpropamine", "lstm_ppo-backpropamine")):
         lines, found = of_rival(name)
-        better.append(found.difference.low is not None and found.difference.low > 0)
+        better.append(above(found.difference))
         said |= {key: f"{sum(solved(lines))} of {len(lines)}", f"{key}_difference": shown(found.difference)}
     return said | {"advantage_verdict": AGREES if all(better) else NOT_FOUND}
 
@@ -100,18 +101,73 @@ def open_loop() -> dict[str, str]:
     return {"no_waits": ", ".join(without), "with_waits": ", ".join(withs), "open_loop_verdict": verdict}
 
 
+def gradients() -> dict[str, str]:
+    """What the page says of reward gradients on large graphs."""
+    found = claim_runs.of_gradient()
+    said = {"gradient_difference": shown(found), "gradient_verdict": AGREES if above(found) else NOT_FOUND}
+    for name in ("gradient", "needle"):
+        lines = claim_runs.runs("large_gradient", reward_fn=name)
+        said[f"success_{name}"] = claim_runs.means("success", lines, "depth")
+    return said
+
+
+def noise() -> dict[str, str]:
+    """What the page says of noisy rewards."""
+    deep = claim_runs.of_noise("3")
+    deeper = claim_runs.of_noise("4")
+    ends = claim_runs.of_negative()
+    noisy = claim_runs.runs("stochastic_rewards", reward_std="1")
+    return {
+        "noise_difference": shown(deep),
+        "deeper_difference": shown(deeper),
+        "noise_success": claim_runs.means("success", noisy, "depth"),
+        "noise_verdict": AGREES if below(deep) and below(deeper) else NOT_FOUND,
+        "ends_difference": shown(ends),
+        "ends_rates": claim_runs.means("end_rate", claim_runs.runs("negative_rewards"), "reward_std"),
+        "ends_verdict": AGREES if below(ends) else NOT_FOUND,
+    }
+
+
+def alike() -> dict[str, str]:
+    """What the page says of images that are alike within a kind of state."""
+    found = claim_runs.of_groups()
+    rates = claim_runs.means("tasks_learned", claim_runs.runs("stochastic_grouped"), "within")
+    return {
+        "alike_difference": shown(found),
+        "alike_rates": rates,
+        "alike_verdict": AGREES if above(found) else NOT_FOUND,
+    }
+
+
+def similarity() -> dict[str, str]:
+    """What the page says of tasks without similarities, and of the wait states that tasks share."""
+    forgetting = claim_runs.of_dissimilar("forgetting")
+    transfer = claim_runs.of_dissimilar(TRANSFER)
+    waiting = claim_runs.of_waiting()
+    return {
+        "dissimilar_forgetting": shown(forgetting),
+        "dissimilar_transfer": shown(transfer),
+        "similar_transfer": shown(claim_runs.of_dissimilar(TRANSFER, "fo_b1_4tasks")),
+        "dissimilar_verdict": AGREES if above(forgetting) and not above(transfer) else NOT_FOUND,
+        "waiting_difference": shown(waiting),
+        "waiting_verdict": AGREES if below(waiting) else NOT_FOUND,
+    }
+
+
 def page() -> str:
     """The page: its template with its numbers."""
     text = (TEMPLATES / "claims.md").read_text(encoding="utf-8")
-    found = {**large_sets(), **advantages(), **open_loop()}
+    parts = (large_sets, advantages, open_loop, gradients, noise, alike, similarity)
+    found: dict[str, str] = {}
+    for part in parts:
+        found |= part()
     verdicts = [value for name, value in found.items() if name.endswith("_verdict")]
     return Template(text).substitute(
         found,
         agents=", ".join(AGENTS[name] for name in RECURRENT),
         num_agrees=verdicts.count(AGREES),
         num_not_found=verdicts.count(NOT_FOUND),
-        num_not_run=text.count(f"**{NOT_RUN}**"),
-        machines=machines("memory_cells"),
+        machines=machines("memory_cells", claim_runs.NAME),
     )
 
 

@@ -42,7 +42,7 @@ def test_the_page_is_that_of_its_template_and_raw_results():
 
 def test_each_of_nine_sentences_has_a_place_a_test_and_a_verdict_and_the_verdicts_are_counted():
     verdicts = [row[-1].strip("*") for row in rows()]
-    counts = [f"{name} {verdicts.count(name)}" for name in ("agrees", "not found", "not run yet")]
+    counts = [f"{name} {verdicts.count(name)}" for name in ("agrees", "not found")]
 
     assert len(verdicts) == 9 and all(all(row) and len(row) == 5 for row in rows())
     assert f"Verdicts: {', '.join(counts)}." in TEXT and sum(int(each.split()[-1]) for each in counts) == 9
@@ -95,7 +95,53 @@ def test_the_best_fixed_sequence_is_optimal_without_waits_and_reaches_the_goal_w
     assert len(re.findall("CT-", number)) == len(TASKS) and verdict == "**agrees**"
 
 
-def test_each_test_that_is_not_run_has_a_command():
-    waiting = [row for row in rows() if "not run yet" in " ".join(row)]
+def outcomes(curriculum: str, column: str, **conditions: str) -> dict[str, float]:
+    """A column of the runs of a curriculum under some conditions, by depth and seed."""
+    with open(FOLDER / "claim_runs.csv", newline="", encoding="utf-8") as file:
+        lines = [line for line in csv.DictReader(file) if line["curriculum"] == curriculum]
+    lines = [line for line in lines if all(line[key] == value for key, value in conditions.items())]
+    return {f"{line['depth']} {line['seed']}": float(line[column] or "nan") for line in lines}
 
-    assert len(re.findall(r"^```bash$", PAGE.split("## Commands")[1], flags=re.M)) == len(waiting)
+
+COMPARED = [
+    (1, "success", ("large_gradient", {"reward_fn": "gradient"}), {"reward_fn": "needle"}, 1),
+    (2, "success", ("stochastic_rewards", {"depth": "3", "reward_std": "1"}), {"depth": "3", "reward_std": "0"}, -1),
+    (3, "end_rate", ("negative_rewards", {"reward_std": "2"}), {"reward_std": "0"}, -1),
+    (5, "tasks_learned", ("stochastic_grouped", {"within": "0.1"}), {"within": "0.3"}, 1),
+]
+"""Row of the table, what is compared, the runs that the sentence is about, those beside them, and the side it names."""
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "about", "beside", "side"), COMPARED, ids=["large", "noise", "ends", "alike"]
+)
+def test_a_sentence_on_two_kinds_of_runs_has_their_difference_and_agrees_where_its_interval_does(
+    row, column, about, beside, side
+):
+    curriculum, conditions = about
+    first = outcomes(curriculum, column, **conditions)
+    second = outcomes(curriculum, column, **beside)
+    number, verdict = rows()[row][3:]
+    shown, low, high = map(float, re.search(r"difference (\S+) \[(\S+), (\S+)\]", number).groups())
+
+    assert first.keys() == second.keys() and len(first) >= 5
+    assert shown == pytest.approx(np.mean([first[run] - second[run] for run in first]), abs=0.0051)
+    assert (verdict == "**agrees**") == (low > 0 if side > 0 else high < 0)
+
+
+def test_the_sentences_on_similarity_have_the_means_of_the_raw_results():
+    transfer = outcomes("fo_b1_dissimilar", "forward_transfer")
+    forgetting = outcomes("fo_b1_dissimilar", "forgetting")
+    number, verdict = rows()[7][3:]
+    forgot, forgot_low, moved = map(
+        float, re.search(r"forgetting (\S+) \[(\S+), .*?transfer (-?[\d.]+)[; ]", number).groups()
+    )
+    frames = [outcomes("su_b1_4tasks", f"frames_{task}") for task in (1, 2, 3, 4)]
+    gained = np.array([np.mean([each[run] for each in frames[1:]]) - frames[0][run] for run in frames[0]])
+    waiting, waiting_verdict = rows()[8][3:]
+
+    assert forgot == pytest.approx(np.mean([*forgetting.values()]), abs=0.0051)
+    assert moved == pytest.approx(np.mean([*transfer.values()]), abs=0.0051)
+    assert (verdict == "**agrees**") == (forgot_low > 0 and moved <= 0)
+    assert float(waiting.split(" [")[0]) == pytest.approx(np.nanmean(gained), abs=0.51)
+    assert (waiting_verdict == "**agrees**") == (float(re.search(r", (\S+)\]", waiting).group(1)) < 0)
