@@ -487,8 +487,9 @@ class PennA(TakesNumbers, TensorDictModuleBase):
 
     def get_extra_state(self) -> NamedValues:
         """Return what `state_dict` has beside tensors of one shape: the population, its age, the optimiser's state."""
-        counts = {"generation": self.generation, "lived": self.lived}
-        return {"population": self.population._asdict(), **counts, "optimiser": self.optimiser.state_dict()}
+        state = {"population": self.population._asdict(), "generation": self.generation, "lived": self.lived}
+        state["optimiser"] = self.optimiser.state_dict()
+        return state
 
     def set_extra_state(self, state: ReadOnlyValues) -> None:
         """Restore what `get_extra_state` returned."""

@@ -459,9 +459,19 @@ def test_at_depth_1_the_goal_is_reached_after_one_step(name, hidden_size, batche
     """
     how = Evaluation(160, greedy=False, before=False, episodes_per_row=4, adapt_episodes=8)
     curriculum = replace(CURRICULUM, blocks=(Block((ONE, TWO), batches * 9_600),), evaluation=how)
-    settings = {"adapt_episodes": 8, "num_steps": 96, "num_envs": 100, "hidden_size": hidden_size}
-    outer = {"outer": "ppo", "gamma": 1.0, "learning_rate": 0.005, "num_epochs": 5, "inner_rate": 1.0}
-    agent = new_agent(curriculum, partial(MAKE[name], **settings, **outer), 0)
+    make = partial(
+        MAKE[name],
+        adapt_episodes=8,
+        num_steps=96,
+        num_envs=100,
+        hidden_size=hidden_size,
+        outer="ppo",
+        gamma=1.0,
+        learning_rate=0.005,
+        num_epochs=5,
+        inner_rate=1.0,
+    )
+    agent = new_agent(curriculum, make, 0)
     torch.manual_seed(0)
 
     log = learn_curriculum(curriculum, agent)

@@ -1,4 +1,4 @@
-"""Success in each episode of a trial with a goal of its own."""
+"""Success in each episode of a trial, which has one goal."""
 
 from __future__ import annotations
 
