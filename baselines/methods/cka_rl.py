@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from baselines.methods.method import TaskMethod
-from baselines.methods.parts.weights import Weights, flat, head_names
+from baselines.methods.parts.weights import Weights, flat, head_names, write_flat
 from baselines.parts.learner import Learner
 from ctgraph_rl.checks import at_least_one, one_of, positive, require, true_or_false
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -109,9 +109,9 @@ class CKARL(TaskMethod):
         """Start a task at w_base and a mixture, or load the weights of one that returns."""
         super().start_task(task)
         if self.slot < self.ended:
-            self._set_own(self.kept[self.slot])
+            write_flat(self.kept[self.slot], list(self.own))
         elif self.slot:
-            self._set_own(self.base)
+            write_flat(self.base, list(self.own))
         if self.num_combined:
             make = torch.randn if self.random_alpha else torch.zeros
             drawn = make(self.num_combined, dtype=torch.float32, device="cpu")
@@ -130,7 +130,7 @@ class CKARL(TaskMethod):
             else:
                 self.base.copy_(present)
         self.kept[self.slot] = present
-        self._set_own(present)
+        write_flat(present, list(self.own))
         self.ended = max(self.ended, self.slot + 1)
 
     def transform_gradients(self, gradients: Sequence[Tensor], weights: Sequence[Tensor]) -> Sequence[Tensor]:
@@ -144,9 +144,7 @@ class CKARL(TaskMethod):
     @torch.no_grad()
     def after_step(self, weights: Sequence[Tensor]) -> None:
         """Write w to the network."""
-        parts = self.current().split([each.numel() for each in self.own])
-        for parameter, part in zip(self._within(weights), parts, strict=True):
-            parameter.copy_(part.view_as(parameter))
+        write_flat(self.current(), self._within(weights))
 
     @torch.no_grad()
     def task_weights(self, task: int) -> Tensor | None:
@@ -156,10 +154,6 @@ class CKARL(TaskMethod):
     def _within(self, tensors: Sequence[Tensor]) -> list[Tensor]:
         """Return those in scope of the network's weights, or of their gradients."""
         return [each for each, inside in zip(tensors, self.inside, strict=True) if inside]
-
-    def _set_own(self, vector: Tensor) -> None:
-        for own, part in zip(self.own, vector.split([each.numel() for each in self.own]), strict=True):
-            own.copy_(part.view_as(own))
 
     def _add(self, vector: Tensor) -> None:
         """Add a vector to the pool; if that is full, the mean of the two most similar vectors replaces them."""

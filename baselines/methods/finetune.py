@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from baselines.methods.method import Method
-from baselines.methods.parts.weights import Weights, flat
+from baselines.methods.parts.weights import Weights, flat, write_flat
 from baselines.parts.learner import Learner
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import one_of, require
@@ -58,4 +58,4 @@ class Finetune(Method):
     @torch.no_grad()
     def after_step(self, weights: Sequence[Tensor]) -> None:
         """Undo the optimiser's changes of the trunk."""
-        self.weights.write(torch.where(self.in_heads | ~self.learned, flat(weights), self.kept))
+        write_flat(torch.where(self.in_heads | ~self.learned, flat(weights), self.kept), weights)

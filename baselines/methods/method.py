@@ -114,6 +114,10 @@ class Method(TakesNumbers, Hooks):
         object.__setattr__(self, "agent", agent)  # the method is a submodule of the agent, not the other way round
         self.weights = weights
 
+    def network_weights(self, trained: list[nn.Parameter]) -> list[nn.Parameter]:
+        """Return the network's, whatever the optimiser trains in their place."""
+        return self.weights.parameters
+
     def start_task(self, task: int | None) -> None:
         """Called at the start of a task, with its id if the protocol gives ids."""
 

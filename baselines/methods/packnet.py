@@ -13,7 +13,7 @@ from torch import Tensor
 
 from baselines.methods.method import TaskMethod
 from baselines.methods.parts.heads import Heads
-from baselines.methods.parts.weights import Weights, flat
+from baselines.methods.parts.weights import Weights, flat, write_flat
 from baselines.parts.learner import Learner
 from ctgraph_rl.checks import is_real, require
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -103,7 +103,7 @@ class PackNet(TaskMethod):
     @torch.no_grad()
     def after_step(self, weights: Sequence[Tensor]) -> None:
         """Undo the optimiser's changes of weights that may not change."""
-        self.weights.write(torch.where(self.live, flat(weights), torch.where(self.mine, self.packed, 0.0)))
+        write_flat(torch.where(self.live, flat(weights), torch.where(self.mine, self.packed, 0.0)), weights)
 
     @torch.no_grad()
     def task_weights(self, task: int) -> Tensor | None:

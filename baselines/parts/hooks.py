@@ -20,6 +20,10 @@ class Hooks(nn.Module):
     stackable: ClassVar[bool] = True
     """Whether the hooks take tensors with the seeds as a leading dimension, see `baselines.update.seeds`."""
 
+    def network_weights(self, trained: list[nn.Parameter]) -> list[nn.Parameter]:
+        """Return the parameters by which the agent's losses are differentiated, given what its optimiser trains."""
+        return trained
+
     def transform_minibatch(self, batch: Data) -> Data:
         """Return the minibatch to learn from in place of the given one."""
         return batch

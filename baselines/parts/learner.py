@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import cached_property
 from typing import Any, ClassVar
 
 import torch
@@ -132,10 +131,10 @@ class Learner(TakesNumbers, nn.Module):
         """Compute `outputs` for one step of all rows, and with memory the next state under ``("next", key)``."""
         return dict(self.outputs(data))
 
-    @cached_property
+    @property
     def weights(self) -> list[nn.Parameter]:
         """The parameters by which the losses are differentiated: what the optimiser trains without a method."""
-        return list(self.trainable)
+        return self.method.network_weights(self.trainable)
 
     @property
     def trainable(self) -> list[nn.Parameter]:
@@ -160,13 +159,13 @@ class Learner(TakesNumbers, nn.Module):
     def weights_changed(self) -> None:
         """Called after weights were changed other than by learning; nothing else depends on them."""
 
-    def losses(self, batch: Data, weights: Sequence[Tensor], others: Data | None = None) -> TensorsByName:
+    def losses(self, batch: Data, weights: Sequence[Tensor], others: Data) -> TensorsByName:
         """Compute the agent's losses and the method's penalties.
 
         Args:
             batch: a minibatch.
             weights: by which the sum is differentiated; the networks have them.
-            others: read in place of `other_weights`, by a ``loss`` that takes them as its second argument.
+            others: as `other_weights` returns them, the second argument of ``loss`` where there are any.
         """
         own = self.loss(batch, others) if others else self.loss(batch)  # type: ignore[call-arg]
         return {**own, **self.method.penalties(batch, weights)}
@@ -194,7 +193,7 @@ class Learner(TakesNumbers, nn.Module):
     @property
     def update_state(self) -> UpdateState:
         """What an update of this learner changes."""
-        return UpdateState(self.weights, parts_of(self.optimiser))
+        return UpdateState(self.weights, parts_of(self.optimiser), others=self.other_weights())
 
     @property
     def is_captured(self) -> bool:

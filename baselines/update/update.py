@@ -66,7 +66,7 @@ class UpdateState(NamedTuple):
     pass."""
 
     others: Mapping[str, Tensor] = {}
-    """Of several seeds what `Learner.other_weights` returns, [seeds, ...] each."""
+    """What `Learner.other_weights` returns, of several seeds [seeds, ...] each."""
 
 
 Update = Callable[["Learner", UpdateState, Data], TensorsByName]
@@ -93,7 +93,7 @@ def update(learner: Learner, state: UpdateState, batch: Data) -> TensorsByName:
 def losses_of(learner: Learner, state: UpdateState, batch: Data) -> TensorsByName:
     """Compute the agent's losses and the method's penalties, of each seed where there are several."""
     if state.tensors is None:
-        return learner.losses(batch, state.weights)
+        return learner.losses(batch, state.weights, state.others)
     return over_seeds(learner, _losses, state, batch, state.others)
 
 

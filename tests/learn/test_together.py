@@ -166,7 +166,8 @@ def of_all(group: SeedGroup, minibatches) -> tuple[dict[str, torch.Tensor], list
 
 
 def of_one(learner, minibatch) -> tuple[dict[str, torch.Tensor], list[torch.Tensor]]:
-    losses = learner.losses({key: wide(value) for key, value in minibatch.items()}, learner.weights)
+    batch = {key: wide(value) for key, value in minibatch.items()}
+    losses = learner.losses(batch, learner.weights, learner.other_weights())
     return losses, transformed(learner, learner.weights, torch.autograd.grad(total_loss(losses), learner.weights))
 
 

@@ -52,11 +52,9 @@ class Weights:
         """Return a copy of all values, float32 [P]; gradients flow back to the parameters."""
         return flat(self.parameters)
 
-    @torch.no_grad()
     def write(self, vector: Tensor) -> None:
         """Set the parameters to the values of a vector, [P]."""
-        for parameter, part in zip(self.parameters, self.split(vector), strict=True):
-            parameter.copy_(part.view_as(parameter))
+        write_flat(vector, self.parameters)
 
     def split(self, vector: Tensor) -> Sequence[Tensor]:
         """Split a vector [..., P] into the parts of each parameter."""
@@ -81,17 +79,22 @@ class Weights:
         """bool [P], true in weight matrices and false in biases."""
         return self.mask_of([name for name, value in self.named if value.ndim > 1])
 
-    @torch.no_grad()
     def write_to(self, policy: TensorDictModuleBase, vector: Tensor) -> None:
         """Set the weights of a copy of the policy to the values of a vector, [P]."""
         parameters = dict(policy.named_parameters())
-        for name, part in zip(self.names, self.split(vector), strict=True):
-            parameters[name].copy_(part.view_as(parameters[name]))
+        write_flat(vector, [parameters[name] for name in self.names])
 
 
 def flat(tensors: Sequence[Tensor]) -> Tensor:
     """Concatenate tensors to one vector."""
     return torch.cat([tensor.flatten() for tensor in tensors])
+
+
+@torch.no_grad()
+def write_flat(vector: Tensor, tensors: Sequence[Tensor]) -> None:
+    """Set tensors to the values of a vector, as `flat` returns it of tensors like them."""
+    for tensor, part in zip(tensors, vector.split([tensor.numel() for tensor in tensors]), strict=True):
+        tensor.copy_(part.view_as(tensor))
 
 
 def head_names(policy: TensorDictModuleBase, without: str | None = None) -> list[str]:

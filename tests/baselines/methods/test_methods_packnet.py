@@ -76,6 +76,20 @@ def test_kept_weights_are_bit_equal_after_later_tasks_and_later_ones_begin_at_ze
     assert not first[free].any() and not second[free].any()
 
 
+@pytest.mark.parametrize("method", [PackNet(retrain=0.5), Finetune(trunk="kept")])
+def test_a_step_is_undone_in_the_weights_that_the_hook_gets(compose, method):
+    attached = with_method(compose, "a2c", method)
+    stay(attached, 0)
+    attached.start_task(1)
+    before = method.weights.vector().detach()
+    given = [torch.ones_like(parameter) for parameter in method.weights.parameters]
+
+    method.after_step(given)
+
+    assert torch.equal(method.weights.vector(), before)
+    assert any((each != 1).any() for each in given)
+
+
 def test_a_kept_trunk_stays_after_the_first_task_and_output_layers_learn_on(compose):
     method = Finetune(trunk="kept")
     attached = with_method(compose, "ppo", method)
