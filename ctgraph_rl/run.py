@@ -74,8 +74,15 @@ def show(run_dir: Path, report: bool) -> None:
     here = Path.cwd()
     shown = run_dir.relative_to(here) if run_dir.is_relative_to(here) else run_dir
     print(f"results: {terminal_text(shown)}")
-    how = f"ctgraph-rl report {shlex.quote(str(shown))}"
-    print(f"report: {write_report([shown]).page}" if report else f"{how} makes a page of figures and tables")
+    print(f"report: {write_report([shown]).page}" if report else _page(f"report {shlex.quote(str(shown))}"))
+
+
+def _page(command: str) -> str:
+    """Return the command that makes a page, and what to install for it where that is missing."""
+    from ctgraph_rl.report.style import PACKAGES  # here: --help and a wrong setting need no torch
+
+    first = "" if all(map(find_spec, PACKAGES)) else "; first pip install 'ctgraph_rl[report]'"
+    return f"ctgraph-rl {command} makes a page of figures and tables{first}"
 
 
 def show_sweep(run_dirs: Sequence[Path]) -> None:
@@ -83,14 +90,16 @@ def show_sweep(run_dirs: Sequence[Path]) -> None:
     here = Path(os.path.relpath(os.path.commonpath(run_dirs)))
     folder = terminal_text(shlex.quote(str(here)))
     if not (run_dirs[0] / LOG).exists():
-        print(f"ctgraph-rl collectives {folder} makes a page of figures and tables")
-    elif len(run_dirs) > MOST_IN_TABLE or find_spec("scipy") is None:
+        print(_page(f"collectives {folder}"))
+    elif find_spec("scipy") is None:
+        print(f"ctgraph-rl results --per-seed {folder} prints the runs; for means, pip install 'ctgraph_rl[stats]'")
+    elif len(run_dirs) > MOST_IN_TABLE:
         print(f"ctgraph-rl results {folder} prints a table")
     else:
         from ctgraph_rl.report.results import print_table  # here: --help and a wrong setting need no torch
 
         print_table(run_dirs)
-        print(f"\nctgraph-rl report {folder} makes a page of figures and tables of all runs there")
+        print(f"\n{_page(f'report {folder}')}")
 
 
 class CellError(RuntimeError):

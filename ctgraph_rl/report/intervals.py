@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from functools import cache, lru_cache
 from importlib import import_module
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -64,11 +65,11 @@ def _least_mean(values: tuple[float, ...], tail: float) -> float:
         tail: the probability below.
     """
     n = len(values)
-    ones = values.count(1)
-    if ones + values.count(0) == n:
-        return float(scipy("special").betaincinv(ones, n - ones + 1, tail)) if ones else 0.0
     if values[0] == values[-1]:
         return values[0] * tail ** (1 / n)
+    ones = values.count(1)
+    if ones + values.count(0) == n:
+        return float(scipy("special").betaincinv(ones, n - ones + 1, tail))
     below = scipy("interpolate").BSpline.basis_element([0.0, *values]).antiderivative()
     grid = np.linspace(0, values[-1], GRID)
     for _ in range(REFINEMENTS):
@@ -92,7 +93,8 @@ def within_bounds(known: Sequence[float], bounds: Bounds) -> bool:
 @cache
 def median_ranks(n: int, level: float) -> int:
     """Return the largest k for which the k-th smallest and k-th largest of n values cover the median; 0 for none."""
-    return sum(scipy("special").bdtr(i, n, 0.5) <= (1 - level) / 2 for i in range((n + 1) // 2))
+    tails = accumulate(math.comb(n, i) / 2**n for i in range((n + 1) // 2))
+    return sum(tail <= (1 - level) / 2 for tail in tails)
 
 
 def scipy(part: str) -> Any:

@@ -23,6 +23,7 @@ from ctgraph_rl.log.tables import check_table, write_evaluations
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.bounds_of_runs import BoundsOfRuns, bounds_by_curriculum
 from ctgraph_rl.report.formats import FORMATS, LEGENDS, NO_RUN_FINISHED, SENTENCES
+from ctgraph_rl.report.intervals import scipy
 from ctgraph_rl.report.names import displayed, modifications
 from ctgraph_rl.report.statistics import Comparison, Estimate, mean
 from ctgraph_rl.report.terminal import print_note, print_problems
@@ -109,10 +110,15 @@ def table(runs: Sequence[Run], statistics: str = "exact", count: Count = silent)
         runs: finished or not.
         statistics: one of `ctgraph_rl.parsers.STATISTICS`.
         count: is called after each agent on a curriculum.
+
+    Raises:
+        ModuleNotFoundError: for several seeds without scipy.
     """
     bounds = bounds_by_curriculum(runs)
     rows = []
     groups = grouped(runs)
+    if any(len(by_seed) > 1 for by_seed in groups.values()):
+        scipy("stats")
     for done, ((name, agent), by_seed) in enumerate(groups.items(), 1):
         for line in _lines(by_seed, bounds[name], statistics):
             rows.append(Row(name, agent, *line))

@@ -121,7 +121,6 @@ def mean(values: Values, level: float = LEVEL, bounds: LowHigh = UNBOUNDED) -> E
         bounds: the lowest and the highest possible value. A value outside makes them none, unless they are noisy
             `Bounds`.
     """
-    scipy("stats")
     require(*fraction(level=level))
     known, missing = _known(values)
     limits = _checked(bounds)

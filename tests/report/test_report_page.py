@@ -323,6 +323,16 @@ def test_a_run_ends_with_its_report_or_how_to_make_it(tmp_path, monkeypatch, cap
     assert last == ("report: my run/report/report.html" if report else command)
 
 
+def test_a_run_ends_with_what_its_report_needs_where_that_is_missing(tmp_path, monkeypatch, capsys):
+    write_run(tmp_path / "run")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+
+    show(tmp_path / "run", report=False)
+
+    assert capsys.readouterr().out.endswith("tables; first pip install 'ctgraph_rl[report]'\n")
+
+
 def test_a_run_that_could_not_be_reported_is_refused_before_it_begins(compose, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "jinja2", None)
 

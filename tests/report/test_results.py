@@ -47,6 +47,20 @@ def test_solved_tasks_are_counted_at_the_end(tmp_path):
     assert line(rows, "interquartile_return").note == "needs 10 seeds of each task, got 3"
 
 
+def test_several_seeds_without_scipy_are_refused_at_once_and_one_seed_is_not(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "scipy", None)
+    make_run(tmp_path, 0)
+    counted = []
+
+    one = table(all_runs([tmp_path]))
+    make_run(tmp_path, 1)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'ctgraph_rl\[stats\]'"):
+        table(all_runs([tmp_path]), count=lambda *done: counted.append(done))
+
+    assert line(one, "average_performance").estimate.n == 1
+    assert counted == []
+
+
 def test_an_unfinished_run_and_a_missing_one_are_shown(tmp_path):
     for seed in range(3):
         make_run(tmp_path, seed, name="ppo", gamma=0.9)

@@ -353,4 +353,12 @@ def test_without_scipy_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "scipy", None)
 
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'ctgraph_rl\[stats\]'"):
-        statistics.mean([1.0])
+        statistics.mean([0.0, 1.0], level=0.123)  # no other test has cached its quantile
+
+
+def test_one_seed_and_a_median_need_no_scipy(monkeypatch):
+    monkeypatch.setitem(sys.modules, "scipy", None)
+
+    assert str(statistics.mean([1.0])) == "1.00 n = 1"
+    assert str(solved_rate([True])) == "1.00 [0.03, 1.00] n = 1"
+    assert str(median_time([6.0, 5.0, 4.0, 3.0, 2.0, 1.0])) == "3.50 [1.00, 6.00] n = 6"

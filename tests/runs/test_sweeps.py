@@ -52,7 +52,7 @@ def test_a_second_start_does_only_what_is_missing(learned, monkeypatch, capsys):
     lines = capsys.readouterr().out.splitlines(keepends=True)
     said = [line for line in lines if line.startswith("sweep of")]
     assert said == [ALL_DONE.format(2), ALL_DONE.format(6)] and said[0] == lines[0]
-    assert lines[-1] == "ctgraph-rl report runs/su_b1_4tasks makes a page of figures and tables of all runs there\n"
+    assert lines[-1] == "ctgraph-rl report runs/su_b1_4tasks makes a page of figures and tables\n"
     assert sorted(path.name for path in Path("runs").iterdir()) == ["multirun.yaml", "su_b1_4tasks"]
 
 
@@ -69,8 +69,10 @@ def test_a_sweep_that_is_done_ends_with_its_table_and_what_to_do_next(tmp_path, 
     without_scipy = capsys.readouterr().out
 
     assert any(line.split()[:2] == ["average", "performance"] for line in lines)
-    assert lines[-1] == "ctgraph-rl report . makes a page of figures and tables of all runs there"
-    assert too_long == without_scipy == "ctgraph-rl results . prints a table\n"
+    assert lines[-1] == "ctgraph-rl report . makes a page of figures and tables"
+    assert too_long == "ctgraph-rl results . prints a table\n"
+    means = "for means, pip install 'ctgraph_rl[stats]'"
+    assert without_scipy == f"ctgraph-rl results --per-seed . prints the runs; {means}\n"
 
 
 def test_a_failing_cell_stops_no_other_and_is_tried_again(learned, monkeypatch, capsys):
