@@ -68,38 +68,30 @@ def _sweeper() -> str | None:
 def show(run_dir: Path, report: bool) -> None:
     """Print the results of a finished run, and make its report or say how."""
     from ctgraph_rl.report.page import write_report  # here: --help and a wrong setting need no torch
-    from ctgraph_rl.report.terminal import print_summary  # here: as above
+    from ctgraph_rl.report.terminal import makes_page, print_summary  # here: as above
 
     print_summary(run_dir)
     here = Path.cwd()
     shown = run_dir.relative_to(here) if run_dir.is_relative_to(here) else run_dir
     print(f"results: {terminal_text(shown)}")
-    print(f"report: {write_report([shown]).page}" if report else _page(f"report {shlex.quote(str(shown))}"))
-
-
-def _page(command: str) -> str:
-    """Return the command that makes a page, and what to install for it where that is missing."""
-    from ctgraph_rl.report.style import PACKAGES  # here: --help and a wrong setting need no torch
-
-    first = "" if all(map(find_spec, PACKAGES)) else "; first pip install 'ctgraph_rl[report]'"
-    return f"ctgraph-rl {command} makes a page of figures and tables{first}"
+    print(f"report: {write_report([shown]).page}" if report else makes_page(f"report {shlex.quote(str(shown))}"))
 
 
 def show_sweep(run_dirs: Sequence[Path]) -> None:
     """Print the table of a sweep that is done, if it is short and scipy is there, and the command that shows more."""
+    from ctgraph_rl.report import results, terminal  # here: --help and a wrong setting need no torch
+
     here = Path(os.path.relpath(os.path.commonpath(run_dirs)))
     folder = terminal_text(shlex.quote(str(here)))
     if not (run_dirs[0] / LOG).exists():
-        print(_page(f"collectives {folder}"))
+        print(terminal.makes_page(f"collectives {folder}"))
     elif find_spec("scipy") is None:
         print(f"ctgraph-rl results --per-seed {folder} prints the runs; for means, pip install 'ctgraph_rl[stats]'")
     elif len(run_dirs) > MOST_IN_TABLE:
         print(f"ctgraph-rl results {folder} prints a table")
     else:
-        from ctgraph_rl.report.results import print_table  # here: --help and a wrong setting need no torch
-
-        print_table(run_dirs)
-        print(f"\n{_page(f'report {folder}')}")
+        results.print_table(run_dirs)
+        print(f"\n{terminal.makes_page(f'report {folder}')}")
 
 
 class CellError(RuntimeError):
