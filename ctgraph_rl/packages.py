@@ -27,6 +27,9 @@ HERE = Path(__file__).resolve().parent
 FULL_COLLECTIONS = 100
 """Collections of the middle generation between two full ones; Python's default is 10."""
 
+OF_REPORT = ("matplotlib", "jinja2", "scipy")
+"""Packages that the extra ``report`` installs."""
+
 
 @contextmanager
 def first_imports() -> Iterator[None]:
@@ -46,6 +49,12 @@ def first_imports() -> Iterator[None]:
             young, middle, _ = gc.get_threshold()
             gc.set_threshold(young, middle, FULL_COLLECTIONS)
             gc.enable()
+
+
+def makes_page(command: str) -> str:
+    """Return the command that makes a page, and what to install for it where that is missing."""
+    first = "" if all(map(find_spec, OF_REPORT)) else "; first pip install 'ctgraph_rl[report]'"
+    return f"ctgraph-rl {command} makes a page of figures and tables{first}"
 
 
 def conf_dir() -> str:

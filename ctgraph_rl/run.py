@@ -26,7 +26,7 @@ from ctgraph_rl.checks import require
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
 from ctgraph_rl.log.files import LOG
 from ctgraph_rl.log.refuse import quiet_where_nobody_reads
-from ctgraph_rl.packages import check_packages, conf_dir, first_imports
+from ctgraph_rl.packages import check_packages, conf_dir, first_imports, makes_page
 from ctgraph_rl.portable import Restart, become_portable, restart
 from ctgraph_rl.runs.config import check_one_cell, composed, explain, in_sweep, of_hydra
 from ctgraph_rl.runs.settings import in_digits, names_in
@@ -68,7 +68,7 @@ def _sweeper() -> str | None:
 def show(run_dir: Path, report: bool) -> None:
     """Print the results of a finished run, and make its report or say how."""
     from ctgraph_rl.report.page import write_report  # here: --help and a wrong setting need no torch
-    from ctgraph_rl.report.terminal import makes_page, print_summary  # here: as above
+    from ctgraph_rl.report.terminal import print_summary  # here: as above
 
     print_summary(run_dir)
     here = Path.cwd()
@@ -79,19 +79,19 @@ def show(run_dir: Path, report: bool) -> None:
 
 def show_sweep(run_dirs: Sequence[Path]) -> None:
     """Print the table of a sweep that is done, if it is short and scipy is there, and the command that shows more."""
-    from ctgraph_rl.report import results, terminal  # here: --help and a wrong setting need no torch
-
     here = Path(os.path.relpath(os.path.commonpath(run_dirs)))
     folder = terminal_text(shlex.quote(str(here)))
     if not (run_dirs[0] / LOG).exists():
-        print(terminal.makes_page(f"collectives {folder}"))
+        print(makes_page(f"collectives {folder}"))
     elif find_spec("scipy") is None:
         print(f"ctgraph-rl results --per-seed {folder} prints the runs; for means, pip install 'ctgraph_rl[stats]'")
     elif len(run_dirs) > MOST_IN_TABLE:
         print(f"ctgraph-rl results {folder} prints a table")
     else:
-        results.print_table(run_dirs)
-        print(f"\n{terminal.makes_page(f'report {folder}')}")
+        from ctgraph_rl.report.results import print_table  # here: --help and a wrong setting need no torch
+
+        print_table(run_dirs)
+        print(f"\n{makes_page(f'report {folder}')}")
 
 
 class CellError(RuntimeError):

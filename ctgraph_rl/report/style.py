@@ -12,12 +12,10 @@ from typing import Any
 
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, require
 from ctgraph_rl.log.escape import figure_text, terminal_text
+from ctgraph_rl.packages import OF_REPORT
 from ctgraph_rl.visualize.style import import_matplotlib
 
 STYLE = Path(__file__).with_name("style.mplstyle")
-
-PACKAGES = ("matplotlib", "jinja2", "scipy")
-"""Packages that the extra ``report`` installs."""
 
 WIDTH = 7.2
 """Of a figure: a page's text in print."""
@@ -42,7 +40,7 @@ def require_packages(what: str = "the report", *names: str) -> None:
     Raises:
         ModuleNotFoundError: without one of them; names the extra to install.
     """
-    for name in names or PACKAGES:
+    for name in names or OF_REPORT:
         try:
             if name == "matplotlib":
                 import_matplotlib()

@@ -7,7 +7,6 @@ import math
 import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
 from statistics import fmean
@@ -21,7 +20,6 @@ from ctgraph_rl.log.escape import listed, terminal_text
 from ctgraph_rl.log.provenance import numbers_of
 from ctgraph_rl.report.formats import measure_name
 from ctgraph_rl.report.names import modification
-from ctgraph_rl.report.style import PACKAGES
 from ctgraph_rl.runs.read import Curve, History, Problem, Run, code_of, read_run
 from ctgraph_rl.runs.settings import as_before
 
@@ -229,12 +227,6 @@ def print_problems(problems: Sequence[Problem], runs: Sequence[Run]) -> bool:
     for sentence in label_notes(runs):
         print_note("labels", sentence)
     return bool(problems or mixed)
-
-
-def makes_page(command: str) -> str:
-    """Return the command that makes a page, and what to install for it where that is missing."""
-    first = "" if all(map(find_spec, PACKAGES)) else "; first pip install 'ctgraph_rl[report]'"
-    return f"ctgraph-rl {command} makes a page of figures and tables{first}"
 
 
 def print_note(about: str, sentence: str) -> None:
