@@ -124,7 +124,7 @@ def dick2020_pair(num_frames: int = 51_200, one_hot: bool = True) -> Curriculum:
     return sequence("dick2020_pair", tasks, num_frames, version=1, source=DICK_2020, protocol=UNANNOUNCED)
 
 
-META_BATCHES = {2: (501, 20, 20, 40), 3: (1001, 40, 25, 40), 4: (1501, 20, 60, 100)}
+META_BATCHES = {1: (501, 20, 20, 40), 2: (501, 20, 20, 40), 3: (1001, 40, 25, 40), 4: (1501, 20, 60, 100)}
 """By depth: batches, tasks in a batch, episodes of a task before and again after its adaptation, test episodes."""
 
 
@@ -138,9 +138,9 @@ def nm_uniform_goals(num_frames: int | None = None, depth: int = 2) -> Curriculu
 
     Args:
         num_frames: frames of all rows together; None: the bound.
-        depth: 2, 3 or 4.
+        depth: 2, 3 or 4; 1, which is not published, has the numbers of 2.
     """
-    require((depth in META_BATCHES, f"depth must be 2, 3 or 4, as published, got {depth!r}"))
+    require((depth in META_BATCHES, f"depth must be in 1..4, got {depth!r}"))
     batches, tasks_a_batch, episodes, test_episodes = META_BATCHES[depth]
     task = full_mdp("0" * depth, 1, fail_reward=-0.01, one_hot=True)
     tasks = all_goals(replace(task, goal_change=(2 * episodes, 2 * episodes)))
