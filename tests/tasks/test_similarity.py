@@ -85,9 +85,9 @@ def images_of_states(task: Task) -> dict:
     b, d = task.graph.branching_factor, task.graph.depth
     first = {path: number for number, (_, path) in enumerate(s for s in tree_states(b, d) if s[0] == WAIT)}
     paths = {number: path for path, number in first.items()}
-    env, shown = CTGraphEnv([task] * 256, seed=3), set()
+    env, shown = CTGraphEnv([task] * 64, seed=3), set()
     data = env.reset()
-    for action in scripts(200, 256, b + 1):
+    for action in scripts(200, 64, b + 1):
         data = env.step(data.set("action", action))["next"]
         shown.update(zip(env.state_type.tolist(), env.node.tolist(), as_bytes(data["observation"]), strict=True))
         done = data["done"].squeeze(-1)
