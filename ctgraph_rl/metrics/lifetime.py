@@ -180,7 +180,9 @@ of_pairs = partial(
 
 
 @of_pairs(
-    "new2022/ft-ratio", "mean over pairs (a, b) of tp(e2) / tp(e1) of b around a training of a", bounds=not_negative
+    "new2022/ft-ratio",
+    "mean over pairs (a, b) of b's evaluation right after / before training on a, scaled to 1..101",
+    bounds=not_negative,
 )
 def forward_transfer_ratio(regimes: Regimes) -> Tensor:
     """FT: what training a task a, before b's first training, does to the evaluations of b right before and after.

@@ -168,14 +168,17 @@ def results() -> ArgumentParser:
     """Print a table of runs: each agent on each curriculum, with intervals over seeds.
 
     Every seed that any agent has on a curriculum is expected of all: one without a run, with an unfinished run or
-    with an undefined metric is counted, as in n = 9/10. The exit code is 1 if a run cannot be read, or if the code
-    of one configuration has changed between runs; these runs are named and shown separately.
+    with an undefined metric is counted, as in n = 9/10. Agents have the names of their classes: LSTMPPO is
+    agent=lstm_ppo. The page docs/reference/metrics.md explains measures. The exit code is 1 if a run cannot be read, or
+    if the code of one configuration has changed between runs; these runs are named and shown separately.
     """
     parser = _parser(results)
     _add(parser, "runs", "run directories, or folders that hold them", type=existing, nargs="+")
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--all", action="store_true", help="show every measure instead of the most important")
-    which.add_argument("--metrics", metavar="A,B", help="show these measures; 'solved' is one of each task")
+    which.add_argument(
+        "--metrics", metavar="A,B", help="show these measures; solved: each task's share of seeds that solved it"
+    )
     parser.add_argument("--format", choices=TABLE_FORMATS, default="text", help="of what is printed (default: text)")
     kinds = "; ".join(f"{kind}: {what}" for kind, what in STATISTICS.items())
     of_seeds = parser.add_mutually_exclusive_group()

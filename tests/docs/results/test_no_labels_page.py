@@ -138,9 +138,10 @@ def test_found_changes_and_other_alarms_are_counted_from_the_spans(made, masks):
 
     ends = {name: [float(line["average_performance"]) for line in masks[name]] for name in ("adwin", "swoks")}
     assert len(ends["adwin"]) == 5
-    stays = "`swoks_2x4`, PPO, 5 seeds, stays of 384,000 frames"
-    assert f"{stays}: masks driven by a test on the return end at {min(ends['adwin']):.2f}." in README
-    assert f"Masks driven by SWOKS end at {sum(ends['swoks']) / 5:.2f}" in README
+    announced = [float(line["average_performance"]) for line in masks["announced"]]
+    adwin = f"ends at a mean return of {min(ends['adwin']):.2f} with the detector ADWIN, which watches the return"
+    swoks = f"{sum(ends['swoks']) / 5:.2f} with the detector SWOKS (5 seeds)"
+    assert f"{adwin}, {min(announced):.2f} with announced tasks, and {swoks}" in README
 
 
 def test_amd_finds_the_changed_transition_and_forgets_nothing(made):
