@@ -87,6 +87,9 @@ class _Reader(ast.NodeVisitor):
 
     lines: Sequence[str]
     is_module: Callable[[str], bool]
+    with_expressions: bool
+    """Whether to look for calls and private names, too."""
+
     imports: list[Import] = field(default_factory=list)
     calls: list[tuple[str, int]] = field(default_factory=list)
     by_name: list[str | None] = field(default_factory=list)
@@ -94,6 +97,10 @@ class _Reader(ast.NodeVisitor):
     modules: dict[str, str] = field(default_factory=dict)
     depth: int = 0
     typing: bool = False
+
+    def visit(self, node: ast.AST) -> None:
+        if self.with_expressions or not isinstance(node, ast.expr):
+            super().visit(node)
 
     def visit_If(self, node: ast.If) -> None:
         before, self.typing = self.typing, self.typing or "TYPE_CHECKING" in ast.unparse(node.test)
@@ -174,7 +181,7 @@ def read(sources: Mapping[str, str], with_bodies: bool = True) -> list[Module]:
 
     Args:
         sources: texts by the names of their modules.
-        with_bodies: whether to measure functions and to look for starred dicts and public classes, too.
+        with_bodies: whether to look for more than imports: for calls, functions, starred dicts and public classes.
     """
     names = {name.removesuffix(".__init__") for name in sources}
     modules = [_module(name, text, names.__contains__, with_bodies) for name, text in sources.items()]
@@ -196,7 +203,7 @@ def read(sources: Mapping[str, str], with_bodies: bool = True) -> list[Module]:
 
 def _module(name: str, text: str, is_module: Callable[[str], bool], with_bodies: bool) -> Module:
     tree, lines = ast.parse(text), text.splitlines()
-    reader = _Reader(lines, is_module)
+    reader = _Reader(lines, is_module, with_bodies)
     reader.visit(tree)
     found = Module(
         name.removesuffix(".__init__"),
@@ -210,36 +217,36 @@ def _module(name: str, text: str, is_module: Callable[[str], bool], with_bodies:
     )
     if not with_bodies:
         return found
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
     return replace(
         found,
-        functions=tuple(_sizes_of_functions(tree, text)),
-        starred=tuple(_starred_dicts(tree)),
+        functions=tuple(_sizes_of_functions(functions, text)),
+        starred=tuple(_starred_dicts(functions)),
         classes=tuple(_public_classes(tree)),
     )
 
 
-def _starred_dicts(tree: ast.Module) -> Iterator[str]:
+def _starred_dicts(functions: Iterable[ast.FunctionDef | ast.AsyncFunctionDef]) -> Iterator[str]:
     """Functions that star a dict of literal keys into a call, but for those that set other items of it."""
-    for function in ast.walk(tree):
-        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
-            nodes = list(ast.walk(function))
-            made = {name for node in nodes for name in _literal_dicts(node)}
-            if not made:
-                continue
-            starred = {
-                ast.unparse(each.value)
-                for node in nodes
-                if isinstance(node, ast.Call)
-                for each in node.keywords
-                if each.arg is None
-            }
-            changed = {
-                ast.unparse(node.value)
-                for node in nodes
-                if isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Store)
-            }
-            if made & starred - changed:
-                yield function.name
+    for function in functions:
+        nodes = list(ast.walk(function))
+        made = {name for node in nodes for name in _literal_dicts(node)}
+        if not made:
+            continue
+        starred = {
+            ast.unparse(each.value)
+            for node in nodes
+            if isinstance(node, ast.Call)
+            for each in node.keywords
+            if each.arg is None
+        }
+        changed = {
+            ast.unparse(node.value)
+            for node in nodes
+            if isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Store)
+        }
+        if made & starred - changed:
+            yield function.name
 
 
 def _literal_dicts(node: ast.AST) -> Iterator[str]:
@@ -262,17 +269,18 @@ def _public_classes(tree: ast.Module) -> Iterator[str]:
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 
 
-def _sizes_of_functions(tree: ast.Module, text: str) -> list[tuple[str, int]]:
+def _sizes_of_functions(
+    functions: Iterable[ast.FunctionDef | ast.AsyncFunctionDef], text: str
+) -> list[tuple[str, int]]:
     """Functions and the number of tokens in their bodies."""
     tokens = tokenize.generate_tokens(io.StringIO(text).readline)
     lines = [token.start[0] for token in tokens if token.type not in NO_CODE]
     sizes = []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            body = node.body if ast.get_docstring(node) is None else node.body[1:]
-            if body:
-                size = bisect_right(lines, body[-1].end_lineno) - bisect_left(lines, body[0].lineno)
-                sizes.append((node.name, size))
+    for node in functions:
+        body = node.body if ast.get_docstring(node) is None else node.body[1:]
+        if body:
+            size = bisect_right(lines, body[-1].end_lineno) - bisect_left(lines, body[0].lineno)
+            sizes.append((node.name, size))
     return sizes
 
 
@@ -296,7 +304,7 @@ def modules_of_results() -> list[Module]:
 
 @cache
 def modules_of_tests() -> list[Module]:
-    """The modules of the tests, without the bodies of their functions."""
+    """The modules of the tests, of which the rules need the imports."""
     return read(find_sources("tests"), with_bodies=False)
 
 
