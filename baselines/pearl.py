@@ -34,7 +34,7 @@ from torch.nn.functional import one_hot, softplus
 from torchrl.data import Composite, TensorSpec
 
 from baselines.parts.gates import GATES, GatedNetwork, gated_network, require_gated_weights, shown_specs
-from baselines.parts.inner_loop import NetInputs
+from baselines.parts.inner_loop import NetInputs, places
 from baselines.parts.learner import MOST_PASSES, Learner
 from baselines.parts.networks import Data, Items, TensorsByName, draw, entropy, guided, is_greedy, num_actions_of
 from baselines.parts.q_learning import require_replay
@@ -243,10 +243,9 @@ class PEARL(Learner):
         self._store(batch)
         begins = self.replay["begins"]
         num_rows, num_steps = begins.shape
-        place = torch.arange(num_steps, device=begins.device).expand_as(begins)
+        place, first = places(begins)
         ends = begins.roll(-1, dims=1)
         ends[:, -1] = True
-        first = torch.where(begins, place, 0).cummax(dim=1).values
         last = torch.where(ends, place, num_steps).flip(1).cummin(dim=1).values.flip(1)
         for _ in range(self.num_updates):
             row = torch.randint(num_rows, (self.minibatch_size, 1), device=begins.device)

@@ -12,6 +12,10 @@ deviation 1 over the steps before the adaptation, or over those after it. R is t
 linear function of observation and time (Duan et al. 2016, arXiv 1604.06778), fitted to the episodes before the
 adaptation.
 
+The episodes before the adaptation get no credit for what they tell. So the policy before it may drift until it always
+goes to one goal: no other one is found then, and there is nothing to adapt to. PPO keeps it from that with
+``entropy_coeff``: it also maximises the entropy of the policy before the adaptation, with the weights of L.
+
 The step of TRPO bounds the divergence of adapted policies on the episodes that were played, not that of the policy
 before the adaptation. Once all episodes after it succeed, A is only what b misses, of standard deviation 1, and a step
 is still as long as ``max_kl`` allows: the next adapted returns can fall. Both are as published.
@@ -36,10 +40,10 @@ from torchrl.data import Composite, TensorSpec
 
 from baselines.parts.gates import GATES, GatedNetwork, gated_network, require_gated_weights, shown_specs
 from baselines.parts.learner import Learner
-from baselines.parts.networks import Data, Items, TensorsByName, draw, guided, is_greedy, num_actions_of
+from baselines.parts.networks import Data, Items, TensorsByName, draw, entropy, guided, is_greedy, num_actions_of
 from baselines.update.trust_region import trust_region_step
 from baselines.update.update import make_optimiser
-from ctgraph_rl.checks import at_least_one, fraction, one_of, positive, require
+from ctgraph_rl.checks import at_least_one, fraction, not_negative, one_of, positive, require
 from ctgraph_rl.core.dynamics import beside
 from ctgraph_rl.learn.collect import UNSTORED
 
@@ -58,13 +62,22 @@ NamedWeights = TensorsByName
 NetInputs = tuple[Tensor, ...]
 
 
+class Episodes(NamedTuple):
+    """What a loss reads of the steps of a trial, or of several."""
+
+    seen: tuple[Tensor, ...]
+    action: Tensor
+    advantage: Tensor
+    weight: Tensor
+
+
 class Played(NamedTuple):
     """Steps of trials, padded to one length."""
 
     seen: tuple[Tensor, ...]  # what the network reads, [trials, steps, ...] each
     action: Tensor  # int64 [trials, steps]
     reward: Tensor  # [trials, steps]
-    number: Tensor  # of the step's episode, from 1; 0 where padded, int64 [trials, steps]
+    number: Tensor  # of the step's episode in its trial, from 1; 0 where padded, int64 [trials, steps]
 
     def weight(self) -> Tensor:
         """Compute 1 / (E T_e) of each step, 0 where padded, [trials, steps]."""
@@ -83,10 +96,9 @@ class Played(NamedTuple):
 
     def features(self, net: GatedNetwork) -> Tensor:
         """Compute what the baseline reads: o, o^2, t, t^2, t^3 and 1, with t in 100 steps of the episode, float64."""
-        place = torch.arange(self.number.shape[1], device=self.number.device).expand_as(self.number)
         begins = self.number != self.number.roll(1, dims=1)
         begins[:, 0] = True
-        first = torch.where(begins, place, 0).cummax(dim=1).values
+        place, first = places(begins)
         time = (place - first).unsqueeze(-1).double() / 100
         flat = net.flat(self.seen[0]).double()
         return torch.cat([flat, flat**2, time, time**2, time**3, torch.ones_like(time)], dim=-1)
@@ -106,14 +118,16 @@ class Played(NamedTuple):
         std = ((centred**2).sum(dim=1, keepdim=True) / number).sqrt()
         return (centred / (std + SMALLEST_STD)).to(self.reward.dtype)
 
+    def episodes(self, net: GatedNetwork, gamma: float, before: Played) -> Episodes:
+        """Return what a loss reads of these steps, with a baseline fitted to those ``before`` the adaptation."""
+        advantage = self.advantage(net, gamma, before.baseline(net, gamma))
+        return Episodes(self.seen, self.action, advantage, self.weight().to(advantage.dtype))
 
-class Episodes(NamedTuple):
-    """What a loss reads of the steps of a trial, or of several."""
 
-    seen: tuple[Tensor, ...]
-    action: Tensor
-    advantage: Tensor
-    weight: Tensor
+def places(begins: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the place of each step, and that of the last one up to it that ``begins``, int64 [trials, steps] each."""
+    place = torch.arange(begins.shape[1], device=begins.device).expand_as(begins)
+    return place, torch.where(begins, place, 0).cummax(dim=1).values
 
 
 def log_prob(logits: Tensor, action: Tensor) -> Tensor:
@@ -206,21 +220,18 @@ class InnerPolicy(TensorDictModuleBase):
         """Return the weights of all rows, new ones for those that begin a trial or adapt."""
         own = {name: data[key] for name, key in self.own_keys.items()}
         if adapts.any():
-            rows = adapts.nonzero().squeeze(-1)
-            seen = tuple(data[key][rows] for key in self.kept_keys)
-            played = Played(seen, data[ACTIONS][rows], rewards[rows], data[EPISODES][rows])
-            theirs = {name: value[rows] for name, value in own.items()}
+            seen = tuple(data[key][adapts] for key in self.kept_keys)
+            played = Played(seen, data[ACTIONS][adapts], rewards[adapts], data[EPISODES][adapts])
+            theirs = {name: value[adapts] for name, value in own.items()}
             adapted = vmap(self.model.adapt, in_dims=(None, 0, 0))(theta, theirs, self.before(played))
-            own = {name: value.index_copy(0, rows, adapted[name]) for name, value in own.items()}
+            own = {name: value.index_put((adapts,), adapted[name]) for name, value in own.items()}
         for name, first in self.model.start(theta).items():
             own[name] = torch.where(beside(fresh, own[name]), first, own[name])
         return own
 
     def before(self, played: Played) -> Episodes:
         """Return what L reads of the steps before an adaptation."""
-        net = self.model.net
-        advantage = played.advantage(net, self.gamma, played.baseline(net, self.gamma))
-        return Episodes(played.seen, played.action, advantage, played.weight().to(advantage.dtype))
+        return played.episodes(self.model.net, self.gamma, played)
 
     def _remember(self, data: TensorDictBase, rewards: Tensor, episode: Tensor, *, forgets: Tensor) -> None:
         """Write what rows have done, this step included, from the first step on that a row still needs."""
@@ -228,7 +239,7 @@ class InnerPolicy(TensorDictModuleBase):
         now = torch.where(episode <= self.adapt_episodes, episode, 0)
         numbers = torch.cat([earlier, now.unsqueeze(-1)], dim=1)
         needed = (numbers > 0).any(dim=0)
-        first = int(needed.int().argmax()) if needed.any() else len(needed)
+        first = int((needed.cumsum(dim=0) == 0).sum())
         data.set(("next", EPISODES), numbers[:, first:])
         data.set(("next", ACTIONS), torch.cat([data[ACTIONS], data["action"].unsqueeze(-1)], dim=1)[:, first:])
         data.set(("next", REWARDS), rewards[:, first:])
@@ -257,6 +268,7 @@ class InnerLoop(Learner):
         clip_epsilon: how far the probability ratio of PPO may move.
         num_epochs: steps of PPO on a batch.
         max_grad_norm: the gradients of PPO are scaled down to this norm.
+        entropy_coeff: weight in PPO's loss of the entropy before the adaptation.
         num_context: further inputs of the network.
     """
 
@@ -286,14 +298,21 @@ class InnerLoop(Learner):
         clip_epsilon: float,
         num_epochs: int,
         max_grad_norm: float,
+        entropy_coeff: float,
         num_context: int = 0,
     ) -> None:
         super().__init__(num_envs, num_steps, max_grad_norm)
         require(
-            *at_least_one(hidden_size=hidden_size, num_layers=num_layers, gate_size=gate_size, num_epochs=num_epochs),
-            *at_least_one(adapt_episodes=adapt_episodes),
+            *at_least_one(
+                hidden_size=hidden_size,
+                num_layers=num_layers,
+                gate_size=gate_size,
+                num_epochs=num_epochs,
+                adapt_episodes=adapt_episodes,
+            ),
             *positive(inner_rate=inner_rate, max_kl=max_kl, learning_rate=learning_rate, clip_epsilon=clip_epsilon),
             *fraction(gamma=gamma),
+            *not_negative(entropy_coeff=entropy_coeff),
             *one_of(GATES, gate=gate),
             *one_of(OUTER, outer=outer),
         )
@@ -301,6 +320,7 @@ class InnerLoop(Learner):
         require((num_steps >= 2 * adapt_episodes, f"{short}, got {num_steps}"))
         self.adapt_episodes, self.trial_episodes = adapt_episodes, 2 * adapt_episodes
         self.num_context = num_context
+        self.entropy_coeff = entropy_coeff
         self.outer, self.max_kl, self.clip_epsilon, self.num_epochs = outer, max_kl, clip_epsilon, num_epochs
         num_actions = num_actions_of(action_spec)
         require_gated_weights(observation_spec, hidden_size, num_layers, num_context=num_context, gate_size=gate_size)
@@ -339,13 +359,8 @@ class InnerLoop(Learner):
             state[self.policy.own_keys[name]] = value.detach().expand(num_envs, *value.shape).clone()
         return TensorDict(state, batch_size=[num_envs])
 
-    def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """Learn from the whole trials of a batch; without one, nothing is learned or measured."""
-        steps = [self.gradient_step(minibatch) for minibatch in self.minibatches(batch)]
-        return self.mean_measurements(steps) if steps else {}
-
     def minibatches(self, batch: TensorDictBase) -> Iterator[Items]:
-        """Yield the trials of a batch as often as the outer loop takes a step on them."""
+        """Yield the whole trials of a batch, if it has any, as often as the outer loop takes a step on them."""
         trials = self.trials(batch)
         if trials is not None:
             yield from [trials] * (1 if self.outer == "trpo" else self.num_epochs)
@@ -370,10 +385,9 @@ class InnerLoop(Learner):
         is_before = number[rows] <= self.adapt_episodes
         before = self._played(batch, rows, own & is_before)
         after = self._played(batch, rows, own & ~is_before)
-        policy, net = self.policy, self.model.net
+        policy = self.policy
         found = self._as_data(policy.before(before), "before")
-        advantage = after.advantage(net, policy.gamma, before.baseline(net, policy.gamma))
-        found |= self._as_data(Episodes(after.seen, after.action, advantage, after.weight().to(advantage.dtype)))
+        found |= self._as_data(after.episodes(self.model.net, policy.gamma, before))
         found["log_prob"] = log_prob(self._adapted_logits(found), found["action"])
         for name, played in (("before", before), ("after", after)):
             found["measured", name] = (played.reward * (played.number > 0)).sum() / len(rows) / self.adapt_episodes
@@ -386,15 +400,14 @@ class InnerLoop(Learner):
         steps = (chosen.int().argmax(dim=1, keepdim=True) + place).clamp(max=chosen.shape[1] - 1)
         at = rows.unsqueeze(-1), steps
         number = torch.where(place < count, batch["next", "trial"].squeeze(-1)[at], 0)
-        number = torch.where(number > self.adapt_episodes, number - self.adapt_episodes, number)
         seen = tuple(batch[key][at] for key in self.specs)
         return Played(seen, batch["action"][at], batch["next", "reward"].squeeze(-1)[at], number)
 
     def _as_data(self, episodes: Episodes, *labels: str) -> Items:
         """Return episodes by key."""
-        named = {**dict(zip(self.specs, episodes.seen, strict=True)), **episodes._asdict()}
-        del named["seen"]
-        return {(*labels, key) if labels else key: value for key, value in named.items()}
+        keys = *self.specs, *Episodes._fields[1:]
+        values = *episodes.seen, *episodes[1:]
+        return {(*labels, key) if labels else key: value for key, value in zip(keys, values, strict=True)}
 
     def _adapted_logits(self, batch: Data, theta: NamedWeights | None = None) -> Tensor:
         """Compute the logits of all trials after their adaptation, [trials, steps, num_actions]."""
@@ -404,8 +417,15 @@ class InnerLoop(Learner):
         return vmap(self.model.adapted_logits, in_dims=(None, 0, 0))(theta or self.model.theta, before, after)
 
     def loss(self, batch: Data) -> TensorsByName:
-        """Compute the outer loss of what `trials` returned."""
-        return {"loss_policy": self._outer_loss(batch, self._adapted_logits(batch))}
+        """Compute the outer loss of what `trials` returned, and that of the entropy before the adaptation."""
+        losses = {"loss_policy": self._outer_loss(batch, self._adapted_logits(batch))}
+        if self.entropy_coeff > 0:
+            theta = self.model.theta
+            seen = tuple(batch["before", key] for key in self.specs)
+            entropies = entropy(self.model.logits(theta, self.model.start(theta), seen).log_softmax(dim=-1))
+            weight = -self.entropy_coeff * batch["before", "weight"]
+            losses["loss_entropy"] = (weight * entropies).sum(dim=1).mean()
+        return losses
 
     def _outer_loss(self, batch: Data, logits: Tensor) -> Tensor:
         ratio = (log_prob(logits, batch["action"]) - batch["log_prob"]).exp()

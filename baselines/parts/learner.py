@@ -91,9 +91,9 @@ class Learner(TakesNumbers, nn.Module):
         raise NotImplementedError
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """Learn from a batch by gradient steps on its minibatches; see `ctgraph_rl.agent.Agent`."""
+        """Learn from a batch by gradient steps on its minibatches, if it has any; see `ctgraph_rl.agent.Agent`."""
         steps = [self.after_update(self.gradient_step(minibatch)) for minibatch in self.minibatches(batch)]
-        return self.after_batch(self.mean_measurements(steps))
+        return self.after_batch(self.mean_measurements(steps)) if steps else {}
 
     def minibatches(self, batch: TensorDictBase) -> Iterator[Items]:
         """Yield the minibatches of a batch, each for one gradient step, which is taken before the next is made."""

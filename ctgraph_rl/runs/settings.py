@@ -47,6 +47,8 @@ ADDED: dict[str, NamedValues] = {
     "baselines.drqn.DRQN": _CELL,
     "baselines.qrdqn_lstm.QRDQNLSTM": _CELL,
     "baselines.lstm_ppo.LSTMPPO": {**_CELL, **_DEDUPLICATE},
+    "baselines.cavia.CAVIA": {"entropy_coeff": 0.0},
+    "baselines.maml.MAML": {"entropy_coeff": 0.0},
     "baselines.rl2.RL2": {**_CELL, **_DEDUPLICATE},
     "baselines.methods.mask_ri.MaskRI": _BACKBONE,
     "baselines.methods.mask_lc.MaskLC": _BACKBONE,
