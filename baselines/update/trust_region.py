@@ -43,7 +43,9 @@ def trust_region_step(
         parts = vector.split(sizes)
         return logits_of({name: part.view_as(value) for (name, value), part in zip(weights, parts, strict=True)})
 
-    logits, pull = vjp(logits_at, present)
+    at_present = vjp(logits_at, present)
+    logits = at_present[0]
+    pull = at_present[1]
     chances = logits.softmax(dim=-1)
     gradient = pull(grad(loss_of)(logits))[0]
 
