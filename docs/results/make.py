@@ -41,6 +41,7 @@ TABLES = {
     "no_labels": "studies.no_labels.runs",
     "rl2_swap": "studies.baselines.swap",
     "adaptation": "studies.adaptation",
+    "adaptation_swap": "studies.adaptation_swap",
     "claim_runs": "studies.claim_runs",
     "task_free": "studies.no_labels.task_free",
     "together_fo_b1": "studies.together",

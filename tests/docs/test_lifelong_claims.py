@@ -183,7 +183,7 @@ def test_the_papers_claims_compare_means_over_curricula_with_a_pair_for_each_see
 
     measured = {("mask_lc", name, "0"): value for name, value in zip(pairs.MASKS, (0.25, 0.5, 1.0), strict=True)}
     measured |= {("mask_lc", pairs.MASKS[0], "10"): 1.0}
-    rows = PAGE.read_text(encoding="utf-8").split("### The paper's claims")[1].split("\n## ")[0].split("\n| ")[3:]
+    rows = PAGE.read_text(encoding="utf-8").split("### The paper's claims")[1].split("\n## ")[0].split("\n| ")[2:]
 
     assert pairs.over_curricula(measured) == {("mask_lc", "0"): 1.75 / 3}
     assert len(rows) == 8

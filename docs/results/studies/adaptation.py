@@ -7,6 +7,7 @@ from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING, Any
 
+from studies import adaptation_swap
 from studies.raw import HERE, TEMPLATES, Raw, groups, machine_of, machines, mean_of, read, table, write
 
 if TYPE_CHECKING:
@@ -149,7 +150,7 @@ def adaptation_table(depth: int) -> str:
 
 
 def draw(path: Path) -> None:
-    """Draw the success in each episode of a row: a panel for each depth, a line for each seed, and the best search."""
+    """Draw the success in each episode of a row, without gates: a panel for each depth, a line for each seed."""
     from ctgraph_rl.visualize.style import new_figure, save_figure
 
     depths = [depth for depth in (1, 2, 3) if runs(depth)]
@@ -158,27 +159,49 @@ def draw(path: Path) -> None:
     for axes, depth in zip(panels, depths, strict=True):
         _draw_depth(axes, depth)
     panels[0].set_ylabel("share at the goal")
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper left", ncols=3, fontsize=7)
+    legends = [axes.get_legend_handles_labels() for axes in panels]
+    handles, labels = max(legends, key=lambda legend: len(legend[1]))
+    figure.legend(handles, labels, loc="outside upper left", ncols=5, fontsize=7)
     save_figure(figure, path, 220)
 
 
 def _draw_depth(axes: Any, depth: int) -> None:
     lines: Raw = []
-    for position, ((agent, gate), of) in enumerate(runs(depth).items()):
+    for position, agent in enumerate(LABELS):
+        of = runs(depth).get((agent, "none"), {})
         for number, lines in enumerate(of.values()):
             success = [float(line["success"]) for line in lines]
-            name = label(agent, gate) if number == 0 else None
+            name = label(agent, "none") if number == 0 else None
             axes.plot(range(1, len(lines) + 1), success, color=f"C{position}", linewidth=0.9, label=name)
-    best = [float(line["best_search"]) for line in lines]
+    best = [float(line["best_search"]) for line in read(NAME) if line["depth"] == str(depth)][: len(lines)]
     axes.plot(range(1, len(best) + 1), best, "k--", linewidth=1, label="best search")
     axes.set(title=f"depth {depth}", xlabel="episode of a row", ylim=(-0.05, 1.05))
+
+
+def table_of_depths(*depths: int) -> str:
+    """Return a row for each depth and agent with its success after adaptation: means over seeds with intervals."""
+    rows = []
+    for depth in depths:
+        for (agent, gate), of in runs(depth).items():
+            seeds = list(of.values())
+            after = mean_of([adapted(lines) for lines in seeds], SUCCESS)
+            rows.append([str(depth), label(agent, gate), str(len(seeds)), seeds[0][0]["frames"], after])
+    return table(["depth", "agent", "seeds", "frames", "success after adaptation"], rows)
 
 
 def page() -> str:
     """Return the page: its template with its tables and numbers."""
     text = (TEMPLATES / "adaptation.md").read_text(encoding="utf-8")
-    return Template(text).substitute(successes(2), depth_2=adaptation_table(2), machines=machines(NAME))
+    return Template(text).substitute(
+        successes(2),
+        depth_2=adaptation_table(2),
+        depth_1_and_3=table_of_depths(1, 3),
+        swap=adaptation_swap.swap_table(),
+        rl2_swap=mean_of(adaptation_swap.shares("rl2", True), SUCCESS),
+        penn_a_swap=mean_of(adaptation_swap.shares("penn_a", True), SUCCESS),
+        best_swap=f"{adaptation_swap.best_search(4, True):.2f}",
+        machines=machines(NAME, adaptation_swap.NAME),
+    )
 
 
 def make() -> None:

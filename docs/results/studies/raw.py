@@ -169,5 +169,6 @@ def _number(value: float) -> str:
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Markdown."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    texts = [f"| {' | '.join(line)} |" for line in (head, *rows)]
+    texts.insert(1, f"|{'---|' * len(head)}")
+    return "\n".join(texts)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from itertools import product
 from statistics import fmean
 
-from studies import adaptation
+import pytest
+from studies import adaptation, adaptation_swap
 
 
 def curves(agent: str, gate: str = "none") -> list[list[float]]:
@@ -18,7 +20,7 @@ def test_the_page_is_made_from_the_raw_results():
 
 
 def test_agents_with_an_inner_loop_do_not_search_and_the_others_do():
-    for curve in (*curves("cavia"), *curves("cavia", "hard"), *curves("maml")):
+    for curve in (*curves("cavia"), *curves("maml")):
         assert abs(fmean(curve[:20]) - 0.25) < 0.05
         assert fmean(curve[20:]) < 0.8
     for curve in (*curves("pearl"), *curves("rl2")):
@@ -29,3 +31,24 @@ def test_rl2_loses_success_in_late_episodes_of_three_seeds():
     lost = [fmean(curve[16:20]) - fmean(curve[-4:]) for curve in curves("rl2")]
 
     assert [loss > 0.1 for loss in lost].count(True) == 3
+
+
+def test_one_soft_gate_reaches_no_end_and_the_seeds_with_gates_overlap_those_without():
+    assert [fmean(curve) < 0.01 for curve in curves("cavia", "soft")].count(True) == 1
+    assert max(fmean(curve[20:]) for curve in curves("pearl", "hard_straight_through")) < 0.6
+
+
+def test_the_best_search_for_a_swapped_goal_is_what_playing_it_gives():
+    """Goals 0 to 3 in turn; after a miss of a known goal, the others in turn."""
+    misses = []
+    for first, second in product(range(4), repeat=2):
+        others = [goal for goal in range(4) if goal != first]
+        misses.append(first + (0 if first == second else 1 + others.index(second)))
+
+    assert adaptation_swap.best_search(4, swapped=True) == pytest.approx(1 - fmean(misses) / 100)
+    assert adaptation_swap.best_search(4, swapped=False) == pytest.approx(0.985)
+
+
+def test_penn_a_is_within_two_points_of_the_best_search_and_rl2_is_not():
+    assert min(adaptation_swap.shares("penn_a", held_out=True)) > 0.95
+    assert max(adaptation_swap.shares("rl2", held_out=True)) < 0.5

@@ -1,0 +1,85 @@
+"""Agents whose goal is swapped in the middle of each life: a table of adaptation.md."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from studies.raw import groups, machine_of, mean_of, read, table, write
+
+NAME = "adaptation_swap"
+
+LABELS = {"penn_a": "PENN-A", "rl2": "RL^2"}
+
+EPISODES = 100
+"""Episodes of a life."""
+
+
+def best_search(goals: int, swapped: bool) -> float:
+    """Return the greatest mean share of a life's episodes at the goal, over goals that are drawn uniformly.
+
+    The search tries goals in turn and misses (goals - 1) / 2 episodes in the mean. A swap draws from all goals; where
+    the goal is another one, the first miss tells it, and the others are tried in turn.
+    """
+    misses = (goals - 1) / 2
+    if swapped:
+        misses += (goals - 1) / goals * (1 + (goals - 2) / 2)
+    return 1 - misses / EPISODES
+
+
+def collect(name: str, folders: Sequence[Path]) -> None:
+    """Write a line for each task of the last evaluation of the finished runs under some folders."""
+    paths = [path for folder in folders for path in folder.rglob("metrics.json")]
+    lines = [line for path in sorted(paths) for line in measured(path.parent)]
+    write(name, sorted(lines, key=lambda line: (line["agent"], line["seed"], line["task"])))
+
+
+def measured(run: Path) -> list[dict[str, Any]]:
+    """Return a line for each task of the last evaluation of a run."""
+    from ctgraph_rl.log.files import LOG
+    from ctgraph_rl.log.run_log import RunLog
+
+    log = RunLog.read(run / LOG)
+    about = log.of_kind("run")[0]
+    evaluations = log.of_kind("evaluation")
+    frames = evaluations[-1]["frames"]
+    return [
+        {
+            "agent": about["config"]["agent"]["_target_"].split(".")[1],
+            "seed": about["config"]["seed"],
+            "frames": frames,
+            "task": line["task"],
+            "label": line["label"],
+            "held_out": line["held_out"],
+            "success": round(line["success_rate"], 6),
+            "return": round(line["return_mean"], 6),
+            **machine_of(about),
+        }
+        for line in evaluations
+        if line["frames"] == frames
+    ]
+
+
+def shares(agent: str, held_out: bool) -> list[float]:
+    """Return the share of episodes at the goal of each seed: of lives with a swap, held out, or with one goal."""
+    lines = [line for line in read(NAME) if (line["agent"], line["held_out"]) == (agent, str(held_out))]
+    return [sum(float(line["success"]) for line in of) / len(of) for of in groups(lines, "seed").values()]
+
+
+def swap_table() -> str:
+    """Return a row for each agent: means over seeds with their intervals."""
+    frames = {line["agent"]: line["frames"] for line in read(NAME)}
+    rows = [
+        [
+            LABELS[agent],
+            str(len(shares(agent, True))),
+            frames[agent],
+            mean_of(shares(agent, False), (0.0, 1.0)),
+            mean_of(shares(agent, True), (0.0, 1.0)),
+        ]
+        for agent in LABELS
+        if agent in frames
+    ]
+    rows.append(["*best search*", "exact", "-", f"{best_search(4, False):.3f}", f"{best_search(4, True):.3f}"])
+    return table(["agent", "seeds", "frames", "one goal", "a goal that is swapped"], rows)
