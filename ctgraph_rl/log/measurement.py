@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Any
 
 from ctgraph_rl.checks import LARGEST_INT, NamedValues, ReadOnlyValues, is_int, is_real, is_shallow, require
@@ -30,10 +31,6 @@ def _are(holds: Callable[[Any], bool], value: object) -> bool:
     return isinstance(value, list) and all(map(holds, value))
 
 
-def _are_texts(value: object) -> bool:
-    return _are(_is_text, value)
-
-
 def _is_task(value: object) -> bool:
     return is_int(value, 1, MOST)
 
@@ -54,12 +51,8 @@ def _are_seeds(value: object) -> bool:
     return value is None or _are(is_int, value)
 
 
-def _are_experts(value: object) -> bool:
-    """Whether it says of each single-task expert at least its task."""
-    return _are(_is_expert, value)
-
-
 def _is_expert(value: object) -> bool:
+    """Whether it says of a single-task expert at least its task."""
     return isinstance(value, Mapping) and _is_task(value.get("task")) and _are_seeds(value.get("together"))
 
 
@@ -68,12 +61,12 @@ RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "schema": (is_int, "an integer"),
     "config": (lambda value: value is None or isinstance(value, Mapping), "an object"),
     "trained": (_are_blocks, f"lists of numbers of tasks in 1..{MOST:,}"),
-    "tasks": (_are_texts, "a list of texts"),
+    "tasks": (partial(_are, _is_text), "a list of texts"),
     "numbers": (is_int, "an integer"),
     **dict.fromkeys(("sources", "versions"), (_are_sources, "an object of texts")),
     "together": (_are_seeds, "a list of seeds"),
     "experts": (
-        _are_experts,
+        partial(_are, _is_expert),
         "a list of objects with a task and, where seeds were trained together, the list of those",
     ),
     "block": (lambda value: is_int(value, 0, MOST), f"an integer in 0..{MOST:,}"),

@@ -10,15 +10,11 @@ from helpers.small_agents import (
     AGENTS,
     EVOLVING,
     GREEDY,
-    Q_LEARNERS,
-    SAMPLED,
     YAML,
     agent_of,
     batches,
     learnt_from,
     others_slow,
-    parameters_equal,
-    saved_and_loaded,
 )
 from torchrl.envs.utils import set_exploration_type
 
@@ -106,41 +102,6 @@ def test_learning_changes_every_parameter_of_the_policy_but_not_the_batch_and_re
     assert all(not torch.equal(*pair) for pair in zip(before, agent.policy.parameters(), strict=True))
     assert all(type(value) is float and abs(value) < float("inf") for value in measurements.values())
     assert {"grad_norm"} < set(measurements) and any(key.startswith("loss_") for key in measurements)
-
-
-@pytest.mark.parametrize("name", others_slow(AGENTS, "dqn", "lstm_ppo", "rl2"))
-def test_a_saved_agent_acts_the_same_after_loading(small_agent, name):
-    agent, other = small_agent(name, [ct_su_b1()]), small_agent(name, [ct_su_b1()], "seed=1")
-    data = batches(agent, ct_su_b1(), 1)[0]
-    agent.learn(data)
-
-    other.load_state_dict(saved_and_loaded(agent.state_dict()))
-
-    for exploration in (GREEDY, SAMPLED):
-        with set_exploration_type(exploration), torch.no_grad():
-            torch.manual_seed(3)
-            expected = agent.policy(reading(agent, data[:, 0]))
-            torch.manual_seed(3)
-            found = other.policy(reading(agent, data[:, 0]))
-        assert (expected == found).all()
-
-
-@an_agent_of_each_family
-def test_a_saved_agent_goes_on_as_if_never_stopped(small_agent, name):
-    short = ["agent.target_update_interval=5"] if name in Q_LEARNERS else []
-    agent, other = small_agent(name, [ct_su_b1()], *short), small_agent(name, [ct_su_b1()], "seed=1", *short)
-    first, second, third = batches(agent, ct_su_b1(), 3)
-    agent.learn(first)
-    agent.learn(second)
-
-    other.load_state_dict(saved_and_loaded(agent.state_dict()))
-    torch.manual_seed(4)
-    expected = agent.learn(third)
-    torch.manual_seed(4)
-    found = other.learn(third)
-
-    assert found == expected
-    assert parameters_equal(agent, other)
 
 
 @every_agent
