@@ -27,7 +27,7 @@ class Row(NamedTuple):
 
 ROWS = [
     Row(*line.strip("|").split(" | ")) for line in PAGE.read_text(encoding="utf-8").splitlines() if line[:2] == "| "
-][2:]
+][1:]
 
 
 def names_in(cell: str) -> list[str]:
