@@ -100,12 +100,8 @@ class Backpropamine(Cell):
         before, hebb, *trace = state
         fast = columns_times(before, torch.mul(self.plasticity, hebb, out=product))
         units = (given + before @ self.recurrent + fast).tanh()
-        eta = self._eta(units)
+        eta = self.rate if self.modulation == "none" else self.fan_out(self.modulator(units).tanh())
         column = before.unsqueeze(2)
         change = (trace[0], eta.unsqueeze(1)) if trace else (column, (eta * units).unsqueeze(1))
         following = torch.addcmul(hebb, *change).clamp_(-LARGEST_FAST_WEIGHT, LARGEST_FAST_WEIGHT)
         return units, (units, following, *(each.lerp(column * units.unsqueeze(1), self.rate) for each in trace))
-
-    def _eta(self, units: Tensor) -> Tensor:
-        """Compute eta_t, [rows, H], or the learned rate without modulation, []."""
-        return self.rate if self.modulation == "none" else self.fan_out(self.modulator(units).tanh())

@@ -171,7 +171,9 @@ class _Learner:
         self.device = device
         self.saved = saved
         self.random = member.random
-        self.random_cuda = _cuda_stream(member.seed, device)
+        self.random_cuda = None
+        if device.type == "cuda":
+            self.random_cuda = torch.Generator(device=device).manual_seed(member.seed).get_state()
         self.is_done = saved is not None and saved["done"]
         self.has_learned = False
         states = None if saved is None or self.is_done else [saved]
@@ -228,11 +230,6 @@ class _Learner:
                 [state] = self.steps.state()
             return {**state, "done": self.is_done}
         return {**(self.saved or {}), "agent": self.member.agent.state_dict(), "log": self.member.log.position()}
-
-
-def _cuda_stream(seed: int, device: torch.device) -> Tensor | None:
-    """Return the state of a GPU's generator of a run with this seed; None on a CPU."""
-    return torch.Generator(device=device).manual_seed(seed).get_state() if device.type == "cuda" else None
 
 
 class _Collective:

@@ -293,7 +293,8 @@ class Evaluator:
         moment = self.curriculum.moment(frames)
         if moment is not None:
             policy = self._policy(agent, self.tasks_at(frames), frames)
-            self.evaluate(_of_data(policy), frames, moment, agent.initial_state)
+            acts = policy.__call__ if isinstance(policy, nn.Module) else policy  # reads TensorDicts whatever it is
+            self.evaluate(acts, frames, moment, agent.initial_state)
 
     def evaluate(self, policy: Policy, frames: int, moment: str, initial_state: InitialState | None = None) -> None:
         """Evaluate a policy after ``frames`` frames and append one line for each task."""
@@ -352,11 +353,6 @@ class Evaluator:
 def _of_each(agent: Agent, policies: Sequence[Policy]) -> Policy:
     """Return the agent's policy where it is that of each task, or else one that acts with each in its slice of rows."""
     return agent.policy if all(policy is agent.policy for policy in policies) else by_slices(policies)
-
-
-def _of_data(policy: Policy) -> Policy:
-    """Return an agent's policy, which reads TensorDicts whatever its class is."""
-    return policy.__call__ if isinstance(policy, nn.Module) else policy
 
 
 def by_slices(policies: Sequence[Policy]) -> Policy:
