@@ -4,8 +4,6 @@ Schulman et al. 2017 (arXiv 1707.06347). The loss has the values of TorchRL's `C
 of a batch, so the trunk sees sequences in order. Its state is reset wherever ``is_init`` is set.
 """
 
-from __future__ import annotations
-
 from baselines.ppo import PPO
 
 

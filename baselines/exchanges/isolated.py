@@ -1,7 +1,5 @@
 """No exchange: no member of a collective learns from another. Other exchanges are compared with it."""
 
-from __future__ import annotations
-
 from baselines.exchanges.exchange import Exchange
 
 

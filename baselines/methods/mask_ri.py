@@ -3,8 +3,6 @@
 Ben-Iwhiwhu et al. 2023 (TMLR, arXiv 2212.11110), their Mask_RI.
 """
 
-from __future__ import annotations
-
 from baselines.methods.parts.masks import Masks
 
 

@@ -158,11 +158,6 @@ class CTGraph:
         return float(self.num_end_states * self.exact_reward_prob_random)
 
     @property
-    def log_end_prob_random(self) -> float:
-        """ln P_E, finite for every graph."""
-        return self.depth * math.log(self.branching_factor) + self.log_reward_prob_random
-
-    @property
     def reward_prob_navigation(self) -> float:
         """P_RNP: the same for a policy that waits when it must and decides at random, b^-d."""
         return 1 / self.num_end_states

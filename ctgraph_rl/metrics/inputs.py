@@ -1,7 +1,5 @@
 """The inputs of metrics that a run gives. The names of a metric's arguments say which of them it takes."""
 
-from __future__ import annotations
-
 INPUTS = {
     "performance": "the performance matrix, float64 [blocks + 1, tasks]",
     "trained": "for each block, the tasks that it trained, counted from 0",

@@ -4,8 +4,6 @@ A user's own kind has what `ImageSet` names, and yaml reaches it through ``_targ
 tasks, batches and figures use them.
 """
 
-from __future__ import annotations
-
 from ctgraph_rl.tasks.images.generated import GroupedImages, PaperImages
 from ctgraph_rl.tasks.images.image_file import ImageFile
 from ctgraph_rl.tasks.images.image_set import ImageSet, has_cue_element, white_level
