@@ -423,7 +423,7 @@ def test_a_run_resumes_as_if_it_had_not_stopped(name, outer, tmp_path):
     costly = tuple(replace(each, fail_reward=-0.5) for each in (ONE, TWO))
     curriculum = replace(CURRICULUM, blocks=(Block(costly, 960),))
 
-    logs = logs_of_equal_ends(curriculum, partial(made, name, outer=outer, inner_rate=50.0), tmp_path)
+    logs = logs_of_equal_ends(curriculum, partial(made, name, outer=outer, inner_rate=10.0), tmp_path)
 
     returns = [log.training("return_after").nan_to_num(-1) for log in logs]
     assert returns[0].max() > -1
