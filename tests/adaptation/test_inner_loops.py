@@ -465,7 +465,7 @@ def test_what_nothing_can_adapt_to_is_refused_before_any_work():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 101])
+@pytest.mark.parametrize("seed", [0, 2])
 @pytest.mark.parametrize(("name", "hidden_size"), [("cavia", 64), ("maml", 32)])
 def test_at_depth_1_the_goal_is_reached_after_one_step(name, hidden_size, seed):
     """With PPO and gamma=1, where returns of episodes that succeed are equal, so that A is 0 where all do.

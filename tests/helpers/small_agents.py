@@ -96,7 +96,7 @@ def batches(agent, task: Task, count: int, seed: int = 0) -> list:
 def learnt_from(agent, batch) -> list:
     """The batches of which the agent minimises the loss when it learns from a batch."""
     seen, loss = [], agent.loss
-    agent.loss = lambda minibatch: (seen.append(dict(minibatch)), loss(minibatch))[1]
+    agent.loss = lambda minibatch, *others: (seen.append(dict(minibatch)), loss(minibatch, *others))[1]
     agent.learn(batch)
     agent.loss = loss
     return seen
