@@ -159,7 +159,7 @@ def test_ppo_keeps_the_entropy_of_the_policy_before_the_adaptation(name):
 
     losses = agent.loss(trials)
 
-    context = [torch.zeros(*trials["before", "action"].shape, 3)] * (name == "cavia")
+    context = [torch.zeros(*trials["before", "action"].shape, 3)] if name == "cavia" else []
     policy = torch.distributions.Categorical(logits=agent.model.net(trials["before", "observation"], *context))
     expected = -0.5 * (trials["before", "weight"] * policy.entropy()).sum(dim=1).mean()
     torch.testing.assert_close(losses["loss_entropy"], expected)
@@ -472,6 +472,7 @@ def test_at_depth_1_the_goal_is_reached_after_one_step(name, hidden_size, seed):
 
     Episodes with one return say nothing, so that k of them before the step allow 1 - 2^-k at most after it. Without
     the entropy's weight the policy before the step comes to go to one goal always, and success falls to 1/2.
+    With the seeds 0 to 4 both end above 0.9, but for CAVIA with seed 1, at 0.81.
     """
     how = Evaluation(160, greedy=False, before=False, episodes_per_row=4, adapt_episodes=8)
     curriculum = replace(CURRICULUM, blocks=(Block((ONE, TWO), 20 * 9_600),), evaluation=how)

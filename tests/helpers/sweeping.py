@@ -3,7 +3,7 @@
 Hydra parses each file once in a process, and finds and merges those of equal choices once. A configuration is what the
 choices of groups give, with settings on top of it. The first is kept for equal choices of equal files, the second is
 done each time. Files of this package and of Hydra stay equal while tests run. What is kept is pickled: OmegaConf takes
-six times as long to copy it. Where Hydra copies values, it copies no more of them than can change.
+six times as long to copy it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ from hydra._internal.hydra import Hydra
 from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
-from omegaconf.nodes import ValueNode
 
 from ctgraph_rl import packages
 from ctgraph_rl import run as run_module
@@ -97,23 +96,12 @@ def compose_once(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(CachingConfigRepository, "__init__", _of_one_delegate)
     patch.setattr(config_loader_impl, "create_defaults_list", list_once)
     patch.setattr(ConfigLoaderImpl, "_compose_config_from_defaults_list", merge_once)
-    patch.setattr(ValueNode, "_deepcopy_impl", _copy_what_can_change)
 
 
 def _of_one_delegate(repo: CachingConfigRepository, delegate: Any) -> None:
     """As Hydra's, with a shallow copy of what it asks: it replaces the list of sources and changes none of them."""
     repo.delegate = copy.copy(delegate)
     repo.cache = {}
-
-
-def _copy_what_can_change(node: ValueNode, copied: ValueNode, memo: dict[int, Any]) -> None:
-    """As OmegaConf's, with the same types, names and numbers, which nothing changes in place."""
-    metadata = copy.copy(node._metadata)
-    metadata.flags = copy.copy(metadata.flags)
-    metadata.resolver_cache = copy.copy(metadata.resolver_cache)
-    copied.__dict__["_metadata"] = metadata
-    copied.__dict__["_val"] = node._val
-    copied.__dict__["_parent"] = node._parent
 
 
 def _content(source: Any) -> tuple[Any, ...]:

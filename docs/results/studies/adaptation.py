@@ -8,7 +8,7 @@ from string import Template
 from typing import TYPE_CHECKING, Any
 
 from studies import adaptation_swap
-from studies.raw import HERE, TEMPLATES, Raw, groups, machine_of, machines, mean_of, read, table, write
+from studies.raw import HERE, TEMPLATES, Raw, groups, lines_of_runs, machine_of, machines, mean_of, read, table, write
 
 if TYPE_CHECKING:
     from ctgraph_rl.report.intervals import Bounds
@@ -34,8 +34,7 @@ SUCCESS = (0.0, 1.0)
 
 def collect(name: str, folders: Sequence[Path]) -> None:
     """Write a line for each episode of rows in the last evaluation of the finished runs under some folders."""
-    paths = [path for folder in folders for path in folder.rglob("metrics.json")]
-    lines = [line for path in sorted(paths) for line in measured(path.parent)]
+    lines = lines_of_runs(folders, measured)
     write(name, sorted(lines, key=lambda line: (line["depth"], line["agent"], line["gate"], line["seed"])))
 
 
@@ -197,9 +196,9 @@ def page() -> str:
         depth_2=adaptation_table(2),
         depth_1_and_3=table_of_depths(1, 3),
         swap=adaptation_swap.swap_table(),
-        rl2_swap=mean_of(adaptation_swap.shares("rl2", True), SUCCESS),
-        penn_a_swap=mean_of(adaptation_swap.shares("penn_a", True), SUCCESS),
-        best_swap=f"{adaptation_swap.best_search(4, True):.2f}",
+        rl2_swap=mean_of(adaptation_swap.shares("rl2", held_out=True), SUCCESS),
+        penn_a_swap=mean_of(adaptation_swap.shares("penn_a", held_out=True), SUCCESS),
+        best_swap=f"{adaptation_swap.best_search(goals=4, swapped=True):.2f}",
         machines=machines(NAME, adaptation_swap.NAME),
     )
 

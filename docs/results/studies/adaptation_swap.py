@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from studies.raw import groups, machine_of, mean_of, read, table, write
+from studies.raw import groups, lines_of_runs, machine_of, mean_of, read, table, write
 
 NAME = "adaptation_swap"
 
@@ -30,8 +30,7 @@ def best_search(goals: int, swapped: bool) -> float:
 
 def collect(name: str, folders: Sequence[Path]) -> None:
     """Write a line for each task of the last evaluation of the finished runs under some folders."""
-    paths = [path for folder in folders for path in folder.rglob("metrics.json")]
-    lines = [line for path in sorted(paths) for line in measured(path.parent)]
+    lines = lines_of_runs(folders, measured)
     write(name, sorted(lines, key=lambda line: (line["agent"], line["seed"], line["task"])))
 
 
@@ -73,13 +72,14 @@ def swap_table() -> str:
     rows = [
         [
             LABELS[agent],
-            str(len(shares(agent, True))),
+            str(len(shares(agent, held_out=True))),
             frames[agent],
-            mean_of(shares(agent, False), (0.0, 1.0)),
-            mean_of(shares(agent, True), (0.0, 1.0)),
+            mean_of(shares(agent, held_out=False), (0.0, 1.0)),
+            mean_of(shares(agent, held_out=True), (0.0, 1.0)),
         ]
         for agent in LABELS
         if agent in frames
     ]
-    rows.append(["*best search*", "exact", "-", f"{best_search(4, False):.3f}", f"{best_search(4, True):.3f}"])
+    best = [best_search(goals=4, swapped=swapped) for swapped in (False, True)]
+    rows.append(["*best search*", "exact", "-", *(f"{share:.3f}" for share in best)])
     return table(["agent", "seeds", "frames", "one goal", "a goal that is swapped"], rows)

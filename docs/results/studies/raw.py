@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -165,6 +165,12 @@ def interval_of(found: Estimate) -> str:
 
 def _number(value: float) -> str:
     return f"{value:.0f}" if 100 <= abs(value) < math.inf else f"{value:.2f}".replace("-0.00", "0.00")
+
+
+def lines_of_runs(folders: Sequence[Path], measured: Callable[[Path], list[dict[str, Any]]]) -> list[dict[str, Any]]:
+    """Return the lines that ``measured`` makes of each finished run under some folders, in the order of paths."""
+    paths = sorted(path for folder in folders for path in folder.rglob("metrics.json"))
+    return [line for path in paths for line in measured(path.parent)]
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -11,8 +11,15 @@ from ctgraph_rl.testing import AgentContract, MethodContract
 
 GENERATIONS = ["agent.num_batches=1", "agent.num_trials=1", "agent.num_updates=1"]
 
-SAMPLES = {name: ["method.num_samples=8"] for name in ("ewc", "ewc_published", "mas", "mask_amsc", "mask_sc")}
-SMALL_METHOD = {"clear": ["method.buffer_size=48"], **SAMPLES}
+SAMPLES = ["method.num_samples=8"]
+SMALL_METHOD = {
+    "clear": ["method.buffer_size=48"],
+    "ewc": SAMPLES,
+    "ewc_published": SAMPLES,
+    "mas": SAMPLES,
+    "mask_amsc": SAMPLES,
+    "mask_sc": SAMPLES,
+}
 
 METHODS = [method.name for method in catalogue("method") if method.name not in ("finetune", "multitask")]
 """Those that stand between an agent and a curriculum of one task a block."""

@@ -7,6 +7,7 @@ from statistics import fmean
 
 import pytest
 from studies import adaptation, adaptation_swap
+from studies.raw import read
 
 
 def curves(agent: str, gate: str = "none") -> list[list[float]]:
@@ -33,9 +34,8 @@ def test_rl2_loses_success_in_late_episodes_of_three_seeds():
     assert [loss > 0.1 for loss in lost].count(True) == 3
 
 
-def test_one_soft_gate_reaches_no_end_and_the_seeds_with_gates_overlap_those_without():
+def test_one_soft_gate_almost_never_finds_the_goal():
     assert [fmean(curve) < 0.01 for curve in curves("cavia", "soft")].count(True) == 1
-    assert max(fmean(curve[20:]) for curve in curves("pearl", "hard_straight_through")) < 0.6
 
 
 def test_the_best_search_for_a_swapped_goal_is_what_playing_it_gives():
@@ -49,6 +49,15 @@ def test_the_best_search_for_a_swapped_goal_is_what_playing_it_gives():
     assert adaptation_swap.best_search(4, swapped=False) == pytest.approx(0.985)
 
 
-def test_penn_a_is_within_two_points_of_the_best_search_and_rl2_is_not():
-    assert min(adaptation_swap.shares("penn_a", held_out=True)) > 0.95
-    assert max(adaptation_swap.shares("rl2", held_out=True)) < 0.5
+@pytest.mark.parametrize("swapped", [False, True])
+def test_penn_a_is_within_a_point_of_the_best_search(swapped):
+    (share,) = adaptation_swap.shares("penn_a", held_out=swapped)
+
+    assert abs(adaptation_swap.best_search(4, swapped) - share) < 0.01
+
+
+def test_rl2_always_goes_to_one_goal():
+    lines = [line for line in read("adaptation_swap") if (line["agent"], line["held_out"]) == ("rl2", "False")]
+
+    assert [line["success"] for line in lines if line["label"] == "goal1.1"] == ["1.0"] * 3
+    assert [line["success"] for line in lines if line["label"] != "goal1.1"] == ["0.0"] * 9

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from studies.raw import Raw, groups, machine_of, read, write
+from studies.raw import Raw, groups, lines_of_runs, machine_of, read, write
 
 NAME = "rl2_swap"
 
@@ -16,8 +16,7 @@ LEARNED = 0.9
 
 def collect(name: str, folders: Sequence[Path]) -> None:
     """Write a line for each evaluation of the finished runs under some folders."""
-    paths = [path for folder in folders for path in folder.rglob("metrics.json")]
-    lines = [line for path in sorted(paths) for line in measured(path.parent)]
+    lines = lines_of_runs(folders, measured)
     write(name, sorted(lines, key=lambda line: (line["seed"], line["frames"], line["task"])))
 
 
