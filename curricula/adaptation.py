@@ -12,7 +12,7 @@ from ctgraph_rl.tasks.images import OneHot, PaperImages
 from ctgraph_rl.tasks.observations import Observations
 from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from ctgraph_rl.tasks.task import Task
-from curricula.axes import all_goals, given_goals, random_goals
+from curricula.axes import all_goals, given_goals, random_goals, reshaped
 from curricula.draws import below, generator
 from curricula.order import OneOrMore, Tasks, cycle, sequence
 from curricula.published import environment, full_mdp, goal_of
@@ -128,7 +128,8 @@ META_BATCHES = {1: (501, 20, 20, 40), 2: (501, 20, 20, 40), 3: (1001, 40, 25, 40
 """By depth: batches, tasks in a batch, episodes of a task before and again after its adaptation, test episodes."""
 
 
-def nm_uniform_goals(num_frames: int | None = None, depth: int = 2) -> Curriculum:
+@takes_numbers
+def nm_uniform_goals(num_frames: int | None = None, depth: int = 2, kind: str = "full") -> Curriculum:
     """The meta-learning tasks of the neuromodulated-context paper: a uniform random goal for each task.
 
     The observations are vectors of a fully observable graph. A goal lasts as long as a task there: the episodes before
@@ -139,10 +140,13 @@ def nm_uniform_goals(num_frames: int | None = None, depth: int = 2) -> Curriculu
     Args:
         num_frames: frames of all rows together; None: the bound.
         depth: 2, 3 or 4; 1, which is not published, has the numbers of 2.
+        kind: what states show, as in ``axes.observability``; all but ``full`` are not published.
     """
     require((depth in META_BATCHES, f"depth must be in 1..4, got {depth!r}"))
     batches, tasks_a_batch, episodes, test_episodes = META_BATCHES[depth]
     task = full_mdp("0" * depth, 1, fail_reward=-0.01, one_hot=True)
+    if kind != "full":
+        task = reshaped(task, task.graph, kind, task.goal)
     tasks = all_goals(replace(task, goal_change=(2 * episodes, 2 * episodes)))
     bound = batches * tasks_a_batch * 2 * episodes * _longest_episode(depth)
     frames = -(-bound // 512) * 512 if num_frames is None else num_frames

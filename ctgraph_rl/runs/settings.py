@@ -53,6 +53,7 @@ ADDED: dict[str, NamedValues] = {
     "baselines.methods.mask_ri.MaskRI": _BACKBONE,
     "baselines.methods.mask_lc.MaskLC": _BACKBONE,
     "baselines.methods.mask_blc.MaskBLC": _BACKBONE,
+    "curricula.nm_uniform_goals": {"kind": "full"},
     "curricula.from_axes": {
         "read_noise": 0,
         "read_rotation": 0,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -10,6 +11,7 @@ from helpers.task_families import listing
 
 import curricula
 from ctgraph_rl import CTGraph, Observations, Task
+from ctgraph_rl.tasks.configurations import ct_graph
 from ctgraph_rl.tasks.images import ReferenceImages, ReferenceOneHot
 from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from ctgraph_rl.tasks.switch import Drift
@@ -252,6 +254,15 @@ def test_goals_of_the_meta_learning_tasks_are_redrawn_after_the_episodes_of_a_ta
     assert block.num_frames % 512 == 0
 
 
+def test_goals_are_redrawn_on_a_surjective_graph_where_only_the_states_look_alike():
+    (full,) = curricula.load("nm_uniform_goals").blocks
+    (alike,) = curricula.load("nm_uniform_goals", kind="surjective").blocks
+
+    observations = ct_graph(2, 2, fully_observable=False).observations
+    images = ReferenceOneHot(5)
+    assert alike.tasks == tuple(replace(task, observations=observations, images=images) for task in full.tasks)
+
+
 def test_one_wait_image_environments_are_what_the_files_say():
     task = one_wait_image("01", 3)
 
@@ -312,6 +323,7 @@ def test_two_ids_for_one_task_are_refused():
         ("ct28_blocked_skips_d5", {"seed_set": 6}, r"seed_set must be one of 1, 2, 3, 4, 5, got 6"),
         ("penn_a_swap", {"depth": 4}, r"depth must be 2 or 3, as published, got 4"),
         ("nm_uniform_goals", {"depth": 5}, r"depth must be in 1..4, got 5"),
+        ("nm_uniform_goals", {"kind": "none"}, r"kinds must be some of full, .*, got 'none'"),
         ("penn_a_swap", {"seed": -1}, r"seed must be an integer >= 0, got -1"),
         ("penn_a_swap", {"num_lives": 0}, r"num_lives must be in 1..10000, got 0"),
         ("penn_a_swap", {"num_lives": 2, "num_frames": 9}, r"num_frames is of one life: leave it out with num_lives"),
