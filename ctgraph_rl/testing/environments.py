@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 
 from ctgraph_rl.learn.collect import SHOWN, make_env
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.task_like import TaskLike
 from ctgraph_rl.tasks.protocol import Block, Protocol
+from ctgraph_rl.tasks.switch import ByEpisode
 
 NUM_STEPS = 40
 """Steps of a test, in which at least one row should end an episode."""
+
+TOO_LONG = f"no episode ended in {NUM_STEPS} steps: give tasks with a shorter time limit"
 
 
 class _OfTasks:
@@ -51,10 +55,10 @@ class TaskContract(_OfTasks):
         assert once[0] != once[1]
 
     def test_a_curriculum_of_them_has_labels_and_survives_json(self) -> None:
-        """Labels differ, and the fingerprint is that of the tasks' values."""
+        """Each task has a label, and the fingerprint is that of the tasks' values."""
         curriculum = self.curriculum()
 
-        assert len(set(curriculum.labels)) == 2
+        assert all(curriculum.labels)
         assert Curriculum.from_json(curriculum.to_json()).fingerprint == curriculum.fingerprint
         assert replace(curriculum, blocks=curriculum.blocks[:1]).fingerprint != curriculum.fingerprint
 
@@ -71,6 +75,9 @@ class TaskContract(_OfTasks):
 
 class EnvironmentContract(_OfTasks):
     """Tests of the environment that a kind of tasks makes. Override `make_tasks`."""
+
+    shows_task_ids = True
+    """Whether it can show task ids; set it to False if not: a change of the task is then not tested."""
 
     def make_env(self, rows: Sequence[TaskLike], seed: int = 0, **protocol: Any) -> Any:
         """Return an environment with these rows."""
@@ -114,7 +121,7 @@ class EnvironmentContract(_OfTasks):
             total = total * ~done
             ended = ended + int(done.sum())
             assert count.equal(following["step_count"])
-        assert ended, f"no episode ended in {NUM_STEPS} steps: give tasks with a shorter time limit"
+        assert ended, TOO_LONG
 
     def test_equal_seeds_and_actions_give_equal_data(self) -> None:
         """A run repeats bit for bit."""
@@ -128,20 +135,37 @@ class EnvironmentContract(_OfTasks):
 
     def test_a_row_changes_its_task_where_its_episode_ends(self) -> None:
         """``set_tasks(tasks, at_episode_end=True)``, by the ids that rows show."""
+        if not self.shows_task_ids:
+            return
         first, other = self.make_tasks()
         env = self.make_env([first] * 3, task_id="one_hot")
-        changed = torch.zeros(3, 1, dtype=torch.bool, device="cpu")
         env.reset()
         env.set_tasks([first] * 3)
         data = env.reset()
         env.set_tasks([other] * 3, at_episode_end=True)
 
+        self._follow_ids(env, data, lambda episodes: episodes > 0)
+
+    def test_a_switch_changes_the_task_of_each_episode(self) -> None:
+        """``switch_tasks(tasks, switch)``, where an environment that shows ids has it."""
+        tasks = list(self.make_tasks())
+        if not self.shows_task_ids:
+            return
+        env = self.make_env(tasks[:1] * 3, task_id="one_hot")
+        if hasattr(env, "switch_tasks"):
+            env.switch_tasks(tasks, ByEpisode())
+
+            self._follow_ids(env, env.reset(), lambda episodes: episodes % 2 == 1)
+
+    def _follow_ids(self, env: Any, data: TensorDictBase, is_second: Callable[[Tensor], Tensor]) -> None:
+        """Assert that rows show the second task where it is due after so many episodes, [N, 1], and else the first."""
+        episodes = torch.zeros(3, 1, dtype=torch.int64, device="cpu")
         for _ in range(NUM_STEPS):
             step, data = env.step_and_maybe_reset(env.rand_action(data))
-            assert step["next", "task_id"][:, 1:].bool().equal(changed)
-            changed = changed | step["next", "done"]
-            assert data["task_id"][:, 1:].bool().equal(changed)
-        assert changed.any(), f"no episode ended in {NUM_STEPS} steps: give tasks with a shorter time limit"
+            assert step["next", "task_id"][:, 1:].bool().equal(is_second(episodes))
+            episodes = episodes + step["next", "done"]
+            assert data["task_id"][:, 1:].bool().equal(is_second(episodes))
+        assert episodes.any(), TOO_LONG
 
     def test_a_saved_environment_resumes_with_the_same_bits(self) -> None:
         """Where tasks say that they resume."""

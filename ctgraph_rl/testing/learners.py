@@ -38,15 +38,19 @@ class AgentContract:
         return Protocol()
 
     def curriculum(self) -> Curriculum:
-        """Return two small tasks to learn, three batches each."""
-        tasks = [ct_su_b1(goal=goal) for goal in ((1, 1), (2, 2))]
-        blocks = tuple(Block((task,), num_frames=1) for task in tasks)
-        shortest = Curriculum(
-            "contract", 1, "a test", blocks, evaluation=Evaluation(num_episodes=2), protocol=self.protocol()
-        )
-        agent = self.make_agent(*agent_specs(shortest))
+        """Return two blocks of three batches: a small task each, or both tasks for an agent that adapts to drawn ones.
+
+        Failing costs, so that every batch has rewards to learn from.
+        """
+        tasks = tuple(replace(ct_su_b1(goal=goal), fail_reward=-1.0) for goal in ((1, 1), (2, 2)))
+        shortest = tuple(Block((task,), num_frames=1) for task in tasks)
+        curriculum = Curriculum("contract", 1, "a test", shortest, protocol=self.protocol())
+        agent = self.make_agent(*agent_specs(curriculum))
         frames = 3 * agent.num_envs * agent.num_steps
-        return replace(shortest, blocks=tuple(replace(block, num_frames=frames) for block in blocks))
+        adapt_episodes = getattr(agent, "adapt_episodes", 0)
+        blocks = tuple(Block(tasks if adapt_episodes else (task,), frames) for task in tasks)
+        evaluation = Evaluation(num_episodes=2, adapt_episodes=adapt_episodes)
+        return replace(curriculum, blocks=blocks, evaluation=evaluation)
 
     def build(self, curriculum: Curriculum, seed: int = 0) -> Agent:
         """Return a new agent for a curriculum."""
@@ -70,10 +74,12 @@ class AgentContract:
         assert env.action_spec.is_in(written["action"])
 
     def test_it_learns_two_blocks_and_measures_finite_numbers(self) -> None:
-        """Each batch gives a line of the log."""
-        _, log = self.learnt(self.curriculum())
+        """Each batch gives a line of the log, and what the agent saves changes."""
+        curriculum = self.curriculum()
+        agent, log = self.learnt(curriculum)
         lines = log.of_kind("training")
 
+        assert sum_of_state(agent.state_dict()) != sum_of_state(self.build(curriculum).state_dict())
         assert len(lines) == 6
         values = [value for line in lines for value in line.values() if isinstance(value, float)]
         assert all(map(math.isfinite, values))
