@@ -124,11 +124,18 @@ def learner(compose, tmp_path):
     return make
 
 
+def has_reward(state: Path) -> bool:
+    """Whether an agent that reads its last reward, such as RL^2, reads one that is not 0 when it goes on."""
+    carried = decoded(state)["carried"]
+    return "reward" in carried and bool(carried["reward"].any())
+
+
 def check_some(learner: Learner, count: int | None = None) -> None:
-    """The first, the last and ``count`` other states, or all, lead to the same end."""
+    """The first, the last and ``count`` other states, or all, lead to the same end; and one with a last reward."""
     whole, states = learner.whole()
     others = random.Random(str(learner.curriculum)).sample(states, len(states) if count is None else count)
-    chosen = {states[0], states[-1], *others}
+    rewarded = [state for state in states if has_reward(state)]
+    chosen = {states[0], states[-1], *others, *rewarded[:1]}
 
     for state in chosen:
         resumed = learner.resumed(state)

@@ -31,11 +31,18 @@ GATES = {
 }
 SUCCESS = (0.0, 1.0)
 
+FULL = "full"
+SURJECTIVE = "surjective"
+
+WITHOUT_MEMORY = (1 + 1 + 0.25 + 0.25) / 4
+"""The most that a policy which sees one image at all decisions gets, over the goals 1.1, 2.2, 1.2 and 2.1."""
+
 
 def collect(name: str, folders: Sequence[Path]) -> None:
     """Write a line for each episode of rows in the last evaluation of the finished runs under some folders."""
     lines = lines_of_runs(folders, measured)
-    write(name, sorted(lines, key=lambda line: (line["depth"], line["agent"], line["gate"], line["seed"])))
+    order = ("depth", "kind", "agent", "gate", "seed")
+    write(name, sorted(lines, key=lambda line: tuple(line[key] for key in order)))
 
 
 def measured(run: Path) -> list[dict[str, Any]]:
@@ -51,6 +58,7 @@ def measured(run: Path) -> list[dict[str, Any]]:
         raise ValueError(f"{run} has no evaluation with adaptation: run it with evaluation.adapt_episodes")
     common = {
         "depth": config["curriculum"]["depth"],
+        "kind": config["curriculum"].get("kind", FULL),
         "agent": config["agent"]["_target_"].split(".")[1],
         "gate": config["agent"].get("gate", "none"),
         "seed": config["seed"],
@@ -74,9 +82,14 @@ def measured(run: Path) -> list[dict[str, Any]]:
     ]
 
 
-def runs(depth: int) -> dict[tuple[str, ...], dict[tuple[str, ...], Raw]]:
-    """Return the lines of each seed of each agent and gate at a depth, in the order of `LABELS` and `GATES`."""
-    lines = [line for line in read(NAME) if line["depth"] == str(depth)]
+def lines_of(depth: int, kind: str) -> Raw:
+    """Return the lines of one graph."""
+    return [line for line in read(NAME) if (line["depth"], line["kind"]) == (str(depth), kind)]
+
+
+def runs(depth: int, kind: str = FULL) -> dict[tuple[str, ...], dict[tuple[str, ...], Raw]]:
+    """Return the lines of each seed of each agent and gate on a graph, in the order of `LABELS` and `GATES`."""
+    lines = lines_of(depth, kind)
     of = groups(lines, "agent", "gate")
     order = [(agent, gate) for agent in LABELS for gate in GATES if (agent, gate) in of]
     return {key: groups(of[key], "seed") for key in order}
@@ -110,26 +123,27 @@ def bounds_of_regret(lines: Raw) -> Bounds:
     return Bounds(0.0, sum(float(line["best_search"]) for line in lines), noisy=True)
 
 
-def successes(depth: int) -> dict[str, str]:
+def successes(depth: int, kind: str = FULL) -> dict[str, str]:
     """Return the success after adaptation of each agent and gate in words, by ``AGENT`` or ``AGENT_GATE``.
 
-    The range over seeds has ``_seeds`` behind the name.
+    ``KIND_`` stands before it on graphs that are not fully observable. The range over seeds has ``_seeds`` behind it.
     """
     found = {}
-    for (agent, gate), of in runs(depth).items():
+    start = "" if kind == FULL else f"{kind}_"
+    for (agent, gate), of in runs(depth, kind).items():
         seeds = [adapted(lines) for lines in of.values()]
-        name = agent if gate == "none" else f"{agent}_{gate}"
+        name = start + (agent if gate == "none" else f"{agent}_{gate}")
         count = f"{len(seeds)} seeds" if len(seeds) > 1 else "one seed"
         found[name] = f"{mean_of(seeds, SUCCESS)} ({count})"
         found[f"{name}_seeds"] = f"{min(seeds):.2f} to {max(seeds):.2f}"
     return found
 
 
-def adaptation_table(depth: int) -> str:
+def adaptation_table(depth: int, kind: str = FULL) -> str:
     """Return a row for each agent and gate: means over seeds with their intervals; a row for the best search."""
     rows = []
     best: Raw = []
-    for (agent, gate), of in runs(depth).items():
+    for (agent, gate), of in runs(depth, kind).items():
         seeds = list(of.values())
         best = seeds[0]
         rows.append(
@@ -149,14 +163,14 @@ def adaptation_table(depth: int) -> str:
 
 
 def draw(path: Path) -> None:
-    """Draw the success in each episode of a row, without gates: a panel for each depth, a line for each seed."""
+    """Draw the success in each episode of a row, without gates: a panel for each graph, a line for each seed."""
     from ctgraph_rl.visualize.style import new_figure, save_figure
 
-    depths = [depth for depth in (1, 2, 3) if runs(depth)]
-    figure = new_figure(7.2, 3.2)
-    panels = figure.subplots(1, len(depths), squeeze=False, sharey=True)[0]
-    for axes, depth in zip(panels, depths, strict=True):
-        _draw_depth(axes, depth)
+    graphs = [(1, FULL), (2, FULL), (3, FULL), (2, SURJECTIVE)]
+    figure = new_figure(7.2, 3.0)
+    panels = figure.subplots(1, len(graphs), sharey=True)
+    for axes, (depth, kind) in zip(panels, graphs, strict=True):
+        _draw_graph(axes, depth, kind)
     panels[0].set_ylabel("share at the goal")
     legends = [axes.get_legend_handles_labels() for axes in panels]
     handles, labels = max(legends, key=lambda legend: len(legend[1]))
@@ -164,17 +178,20 @@ def draw(path: Path) -> None:
     save_figure(figure, path, 220)
 
 
-def _draw_depth(axes: Any, depth: int) -> None:
+def _draw_graph(axes: Any, depth: int, kind: str) -> None:
     lines: Raw = []
     for position, agent in enumerate(LABELS):
-        of = runs(depth).get((agent, "none"), {})
+        of = runs(depth, kind).get((agent, "none"), {})
         for number, lines in enumerate(of.values()):
             success = [float(line["success"]) for line in lines]
             name = label(agent, "none") if number == 0 else None
             axes.plot(range(1, len(lines) + 1), success, color=f"C{position}", linewidth=0.9, label=name)
-    best = [float(line["best_search"]) for line in read(NAME) if line["depth"] == str(depth)][: len(lines)]
+    best = [float(line["best_search"]) for line in lines_of(depth, kind)][: len(lines)]
     axes.plot(range(1, len(best) + 1), best, "k--", linewidth=1, label="best search")
-    axes.set(title=f"depth {depth}", xlabel="episode of a row", ylim=(-0.05, 1.05))
+    if kind == SURJECTIVE:
+        axes.axhline(WITHOUT_MEMORY, color="0.5", linestyle=":", linewidth=1, label="most without memory")
+    axes.set_title(f"depth {depth}" if kind == FULL else f"depth {depth}, {kind}", fontsize=9)
+    axes.set(xlabel="episode of a row", ylim=(-0.05, 1.05))
 
 
 def table_of_depths(*depths: int) -> str:
@@ -192,7 +209,9 @@ def page() -> str:
     """Return the page: its template with its tables and numbers."""
     text = (TEMPLATES / "adaptation.md").read_text(encoding="utf-8")
     return Template(text).substitute(
-        successes(2),
+        successes(2) | successes(2, SURJECTIVE),
+        surjective=adaptation_table(2, SURJECTIVE),
+        without_memory=f"{WITHOUT_MEMORY:.3f}",
         depth_2=adaptation_table(2),
         depth_1_and_3=table_of_depths(1, 3),
         swap=adaptation_swap.swap_table(),
