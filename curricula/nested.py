@@ -14,13 +14,13 @@ Single agents had 51,200 frames a task in the launchers, where the scripts' defa
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import chain
+from collections.abc import Iterable, Sequence
+from itertools import chain, product
 
 from ctgraph_rl.checks import by_name, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Evaluation
-from curricula.published import MASK_EVALUATION, chosen, labelled, one_wait_image, pool_ids, words
+from curricula.published import MASK_EVALUATION, GoalPool, chosen, labelled, one_wait_image, pool_ids, words
 
 MASKSC = "github.com/DMIU-ShELL/MaskSC (2026)"
 AMSC = "github.com/DMIU-ShELL/AMSC (2026)"
@@ -46,7 +46,7 @@ def ct28(num_frames: int = 51_200) -> Curriculum:
     Args:
         num_frames: frames per task.
     """
-    return _single("ct28", MASKSC, _turns(*map(_family, (1, 2, 3, 4))), num_frames)
+    return _curriculum("ct28", MASKSC, _turns(_families(1, 2, 3, 4)), num_frames)
 
 
 def ct28_interleaved_skips_d5(num_frames: int = 51_200) -> Curriculum:
@@ -55,7 +55,7 @@ def ct28_interleaved_skips_d5(num_frames: int = 51_200) -> Curriculum:
     Args:
         num_frames: frames per task.
     """
-    return _single("ct28_interleaved_skips_d5", MASKSC, _turns(*_inconsistent()), num_frames)
+    return _curriculum("ct28_interleaved_skips_d5", MASKSC, _turns(_inconsistent()), num_frames)
 
 
 def ct28_blocked_skips_d5(num_frames: int = 51_200, seed_set: int = 1) -> Curriculum:
@@ -65,7 +65,7 @@ def ct28_blocked_skips_d5(num_frames: int = 51_200, seed_set: int = 1) -> Curric
         num_frames: frames per task.
         seed_set: which of the five published sets of image seeds, 1..5.
     """
-    return _single("ct28_blocked_skips_d5", LRL, [*chain(*_inconsistent())], num_frames, seed_set)
+    return _curriculum("ct28_blocked_skips_d5", LRL, _one_by_one(_inconsistent()), num_frames, seed_set)
 
 
 def ct28_random_skips_d5(num_frames: int = 51_200) -> Curriculum:
@@ -77,7 +77,7 @@ def ct28_random_skips_d5(num_frames: int = 51_200) -> Curriculum:
     listing = """3:001001 3:0010011 2:11010101 3:00100 1:01011 1:010 3:001 2:1101010 1:01 4:110111 4:11 2:110101
         4:110111001 3:00 1:0101 2:110 4:1101 4:11011100 1:0101101 2:11 2:11010 3:00100110 2:1101 1:010110 4:110 3:0010
         4:1101110 1:01011010"""
-    return _single("ct28_random_skips_d5", LRL, words(listing), num_frames)
+    return _curriculum("ct28_random_skips_d5", LRL, words(listing), num_frames)
 
 
 def ct28_mosaic_skips_d5(num_frames: int = 102_400, seed_set: int = 1, agent: int | None = None) -> Curriculum:
@@ -91,9 +91,9 @@ def ct28_mosaic_skips_d5(num_frames: int = 102_400, seed_set: int = 1, agent: in
         seed_set: which of the five sets of image seeds, 1..5.
         agent: the task of a single agent, 0..27; None: all tasks one after the other, which is ours.
     """
-    tasks = _of_agent([*chain(*_inconsistent())], agent)
+    tasks = _of_agent(_one_by_one(_inconsistent()), agent)
     evaluation = Evaluation(num_episodes=50)
-    return _curriculum("ct28_mosaic_skips_d5", MOSAIC, tasks, num_frames, seed_set, evaluation=evaluation)
+    return _curriculum("ct28_mosaic_skips_d5", MOSAIC, tasks, num_frames, seed_set=seed_set, evaluation=evaluation)
 
 
 def ct28_one_branch(num_frames: int = 51_200) -> Curriculum:
@@ -102,7 +102,7 @@ def ct28_one_branch(num_frames: int = 51_200) -> Curriculum:
     Args:
         num_frames: frames per task.
     """
-    return _single("ct28_one_branch", LRL, _family(1), num_frames, seed_set=5)
+    return _curriculum("ct28_one_branch", LRL, _family(1), num_frames, seed_set=5)
 
 
 def ct10(num_frames: int = 51_200) -> Curriculum:
@@ -111,7 +111,7 @@ def ct10(num_frames: int = 51_200) -> Curriculum:
     Args:
         num_frames: frames per task.
     """
-    return _single("ct10", LRL, _family(1, deepest=11), num_frames)
+    return _curriculum("ct10", LRL, _family(1, deepest=11), num_frames)
 
 
 def ct14_half_1(num_frames: int = 51_200) -> Curriculum:
@@ -120,7 +120,7 @@ def ct14_half_1(num_frames: int = 51_200) -> Curriculum:
     Args:
         num_frames: frames per task.
     """
-    return _single("ct14_half_1", LRL, _family(1), num_frames)
+    return _curriculum("ct14_half_1", LRL, _family(1), num_frames)
 
 
 def ct14_half_2(num_frames: int = 51_200) -> Curriculum:
@@ -129,7 +129,7 @@ def ct14_half_2(num_frames: int = 51_200) -> Curriculum:
     Args:
         num_frames: frames per task.
     """
-    return _single("ct14_half_2", LRL, _family(2), num_frames)
+    return _curriculum("ct14_half_2", LRL, _family(2), num_frames)
 
 
 def ct14_md(num_frames: int = 51_200) -> Curriculum:
@@ -138,7 +138,7 @@ def ct14_md(num_frames: int = 51_200) -> Curriculum:
     Args:
         num_frames: frames per task.
     """
-    return _single("ct14_md", LRL, _turns(_family(1), _family(2)), num_frames)
+    return _curriculum("ct14_md", LRL, _turns(_families(1, 2)), num_frames)
 
 
 def ct8_interleaved(num_frames: int = 51_200) -> Curriculum:
@@ -147,7 +147,7 @@ def ct8_interleaved(num_frames: int = 51_200) -> Curriculum:
     Args:
         num_frames: frames per task.
     """
-    return _single("ct8_interleaved", MASKSC, _turns(_family(1, deepest=5), _family(2, deepest=5)), num_frames)
+    return _curriculum("ct8_interleaved", MASKSC, _turns(_families(1, 2, deepest=5)), num_frames)
 
 
 def ct29_recovery(num_frames: int = 51_200) -> Curriculum:
@@ -157,8 +157,8 @@ def ct29_recovery(num_frames: int = 51_200) -> Curriculum:
         num_frames: frames per task.
     """
     ladder = _family(4)
-    tasks = [*_turns(*map(_family, (1, 2, 3))), ladder[-1], *ladder]
-    return _single("ct29_recovery", AMSC, tasks, num_frames)
+    tasks = [*_turns(_families(1, 2, 3)), ladder[-1], *ladder]
+    return _curriculum("ct29_recovery", AMSC, tasks, num_frames)
 
 
 def ct20(num_frames: int = 102_400, agent: int | None = None) -> Curriculum:
@@ -189,47 +189,74 @@ def mosaic_ladder(num_frames: int = 102_400, agent: int | None = None) -> Curric
 
 def _two_families(name: str, source: str, deepest: int, num_frames: int, agent: int | None) -> Curriculum:
     """The first two families with the ids that all goals of their graphs have."""
-    tasks = _of_agent([*_family(1, deepest), *_family(2, deepest)], agent)
-    pool = [(family, depth) for family in (1, 2) for depth in range(2, deepest + 1)]
+    named = _of_agent(_one_by_one(_families(1, 2, deepest=deepest)), agent)
+    tasks = tuple(one_wait_image(path, family) for family, path in named)
+    pool = _pool((1, 2), deepest)
     num_ids = sum(2**depth for _, depth in pool)
-    made = tuple(one_wait_image(path, family) for family, path in tasks)
-    evaluation = Evaluation()
-    return labelled(name, source, made, pool_ids(tasks, pool), num_ids, num_frames=num_frames, evaluation=evaluation)
+    ids = pool_ids(named, pool)
+    return labelled(name, source, tasks, ids, num_ids, num_frames=num_frames, evaluation=Evaluation())
 
 
 def _family(number: int, deepest: int = 8) -> list[Named]:
     return [(number, PATHS[number][:depth]) for depth in range(2, deepest + 1)]
 
 
+def _families(*numbers: int, deepest: int = 8) -> list[list[Named]]:
+    return [_family(number, deepest) for number in numbers]
+
+
 def _inconsistent() -> list[list[Named]]:
-    return [*map(_family, (1, 2, 3)), [(4, path) for path in FOURTH_SKIPS_D5]]
+    fourth = [(4, path) for path in FOURTH_SKIPS_D5]
+    return [*_families(1, 2, 3), fourth]
 
 
-def _turns(*families: list[Named]) -> list[Named]:
-    return [*chain(*zip(*families, strict=True))]
+def _one_by_one(families: list[list[Named]]) -> list[Named]:
+    return list(chain.from_iterable(families))
+
+
+def _turns(families: list[list[Named]]) -> list[Named]:
+    return list(chain.from_iterable(zip(*families, strict=True)))
 
 
 def _of_agent(tasks: list[Named], agent: int | None) -> list[Named]:
     return tasks if agent is None else [chosen("agent", agent, tasks)]
 
 
-def _single(name: str, source: str, tasks: Sequence[Named], num_frames: int, seed_set: int = 1) -> Curriculum:
-    return _curriculum(name, source, tasks, num_frames=num_frames, seed_set=seed_set, evaluation=MASK_EVALUATION)
+def _pool(families: Iterable[int], deepest: int) -> GoalPool:
+    return list(product(families, range(2, deepest + 1)))
 
 
 def _curriculum(
-    name: str, source: str, tasks: Sequence[Named], num_frames: int, seed_set: int, evaluation: Evaluation
+    name: str,
+    source: str,
+    named: Sequence[Named],
+    num_frames: int,
+    seed_set: int = 1,
+    evaluation: Evaluation = MASK_EVALUATION,
 ) -> Curriculum:
     """Tasks with the ids, and the length of ids, that the files of a set of image seeds have."""
     require((seed_set in SEED_SETS, f"seed_set must be one of {', '.join(map(str, SEED_SETS))}, got {seed_set!r}"))
-    ids = pool_ids(tasks, [(family, depth) for family in PATHS for depth in range(2, 12)])
-    made = tuple(one_wait_image(path, SEED_SETS[seed_set][family - 1]) for family, path in tasks)
+    seeds = SEED_SETS[seed_set]
+    tasks = tuple(one_wait_image(path, seeds[family - 1]) for family, path in named)
+    ids = pool_ids(named, _pool(PATHS, deepest=11))
     num_ids = 16_368 if seed_set == 1 else 16_370
-    return labelled(name, source, made, ids, num_task_ids=num_ids, num_frames=num_frames, evaluation=evaluation)
+    return labelled(name, source, tasks, ids, num_ids, num_frames=num_frames, evaluation=evaluation)
 
 
-_SKIPPING_D5 = (ct28_blocked_skips_d5, ct28_interleaved_skips_d5, ct28_mosaic_skips_d5, ct28_random_skips_d5)
-_SINGLE = (ct8_interleaved, ct10, ct14_half_1, ct14_half_2, ct14_md, ct28, ct28_one_branch, ct29_recovery)
-_TWO_FAMILIES = (ct20, mosaic_ladder)
-NAMED = by_name(*_SKIPPING_D5, *_SINGLE, *_TWO_FAMILIES)
+NAMED = by_name(
+    ct28_blocked_skips_d5,
+    ct28_interleaved_skips_d5,
+    ct28_mosaic_skips_d5,
+    ct28_random_skips_d5,
+    ct8_interleaved,
+    ct10,
+    ct14_half_1,
+    ct14_half_2,
+    ct14_md,
+    ct28,
+    ct28_one_branch,
+    ct29_recovery,
+    ct20,
+    mosaic_ladder,
+)
 """The curricula of this module by name."""
