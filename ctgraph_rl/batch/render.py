@@ -7,7 +7,7 @@ twice the size in palette numbers, and brought to size and to RGB by the mean of
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from itertools import pairwise
 from typing import NamedTuple
@@ -30,9 +30,14 @@ STATE_COLOURS: dict[StateType, tuple[int, int, int]] = {
 }
 """Blue, sky blue, orange, bluish green and vermillion of Okabe and Ito: distinct with any colour vision."""
 
-BACKGROUND, EDGE, GOAL, OUTLINE, WAY = range(5, 10)
-EXTRA_COLOURS = (255, 255, 255), (176, 176, 176), (204, 121, 167), (0, 0, 0), (0, 0, 0)
-PALETTE = np.array([*STATE_COLOURS.values(), *EXTRA_COLOURS], np.uint16)  # a state type's number is its value
+BACKGROUND = 5
+EDGE = 6
+GOAL = 7
+OUTLINE = 8
+WAY = 9
+EXTRA_COLOURS = ((255, 255, 255), (176, 176, 176), (204, 121, 167), (0, 0, 0), (0, 0, 0))
+PALETTE = np.array([*STATE_COLOURS.values(), *EXTRA_COLOURS], np.uint16)
+"""The colours by number; that of a state type is its value."""
 PANEL_GREY = 208
 OFF_GREY = 64  # around an observation, and where a one-hot vector is 0
 MIN_SIZE = 48
@@ -109,7 +114,9 @@ def _show(panels: Pixels, observation: Pixels) -> None:
             images = np.maximum.reduceat(images, np.arange(length * room // longest) * longest // room, axis)
         images = images.repeat(max(room // longest, 1), axis)
     if one_hot and room >= 4 * longest:
-        images[:, :: room // longest] = images[:, :, :: room // longest] = PANEL_GREY
+        cell = room // longest
+        images[:, ::cell] = PANEL_GREY
+        images[:, :, ::cell] = PANEL_GREY
     height, width = images.shape[1:]
     top = (size - height) // 2
     left = (size - width) // 2
@@ -120,33 +127,39 @@ def _grid(vectors: Pixels) -> Pixels:
     """One-hot [N, K] as [N, rows, columns]: the entries row by row in a nearly square grid."""
     n, entries = vectors.shape
     columns = math.ceil(math.sqrt(entries))
-    grid = np.full((n, -(-entries // columns) * columns), PANEL_GREY, np.uint8)
+    rows = math.ceil(entries / columns)
+    grid = np.full((n, rows * columns), PANEL_GREY, np.uint8)
     grid[:, :entries] = np.where(vectors != 0, 255, OFF_GREY)
-    return grid.reshape(n, -1, columns)
+    return grid.reshape(n, rows, columns)
 
 
 def _draw_row(task: Task, kind: int, node: int, goal_leaf: int, size: int) -> Pixels:
     """The right half of a row's picture in palette numbers."""
     graph = task.graph
     unit = size / 192
-    swapped = task.swapped_node
     first_leaf = graph.num_decision_states
     goal = first_leaf + goal_leaf
     whole = graph.num_end_states <= size // LEAF_WIDTH
     base, marks, waits = _picture(graph, size, () if whole else (node, goal))
     canvas = base.copy()
     failed = kind == StateType.FAIL
-    at_wait = kind == StateType.WAIT or (failed and node >= first_leaf)
-    place = waits[node] if at_wait else marks[HOME_KEY if kind == StateType.HOME else node]
+    if kind == StateType.HOME:
+        place = marks[HOME_KEY]
+    elif kind == StateType.WAIT or (failed and node >= first_leaf):
+        place = waits[node]
+    else:
+        place = marks[node]
     way = [marks[key] for key in (HOME_KEY, *graph.nodes_to(node)[:-1])]
-    _lines(canvas, list(pairwise([*way, place])), 2 * unit, WAY)
+    _lines(canvas, pairwise([*way, place]), 2 * unit, WAY)
     _star(canvas, marks[goal], unit)
+    swapped = task.swapped_node
     if swapped in marks:
-        _lines(canvas, _cross(marks[swapped], 0.6 * marks[swapped].radius), unit, OUTLINE)
+        _cross(canvas, marks[swapped], 0.6 * marks[swapped].radius, unit, OUTLINE)
     if failed:
-        _lines(canvas, _cross(place, place.radius + 2.5 * unit), 2 * unit, kind)
-    x, y, radius = marks[FAIL_KEY] if failed else place
-    _fill(canvas, np.array([(x, y)]), _ring(radius + 2 * unit, radius + 4.5 * unit), OUTLINE)
+        _cross(canvas, place, place.radius + 2.5 * unit, 2 * unit, kind)
+    current = marks[FAIL_KEY] if failed else place
+    outline = _ring(current.radius + 2 * unit, current.radius + 4.5 * unit)
+    _fill(canvas, np.array([current[:2]]), outline, OUTLINE)
     return canvas
 
 
@@ -158,37 +171,33 @@ def _picture(graph: CTGraph, size: int, nodes: tuple[int, ...]) -> tuple[Pixels,
     fail = Mark(size * 0.925, size * 0.075, size / 25)
     marks = {HOME_KEY: home, FAIL_KEY: fail}
     stubs = _place_paths(marks, graph, size, gap, nodes) if nodes else _place_all(marks, graph, size, gap)
-    edges = []
-    waits = {}
-    decisions: list[Mark] = []
-    ends: list[Mark] = []
-    for node, mark in marks.items():
-        if node >= 0:
-            parent = marks[graph.parent(node)]
-            edges.append((parent, mark))
-            waits[node] = _middle(parent, mark)
-            (decisions if node < graph.num_decision_states else ends).append(mark)
+    first_leaf = graph.num_decision_states
+    decisions = [mark for node, mark in marks.items() if 0 <= node < first_leaf]
+    ends = [mark for node, mark in marks.items() if node >= first_leaf]
+    edges = {node: (marks[graph.parent(node)], mark) for node, mark in marks.items() if node >= 0}
+    waits = {node: _middle(*edge) for node, edge in edges.items()}
+    stub_ends = [end for _, end in stubs]
     canvas = np.full((SCALE * size, SCALE * size), BACKGROUND, np.uint8)
-    _lines(canvas, [*edges, *stubs], size / 192, EDGE)
-    _discs(canvas, [*waits.values(), *(end for _, end in stubs)], StateType.WAIT)
+    _lines(canvas, [*edges.values(), *stubs], size / 192, EDGE)
+    _discs(canvas, [*waits.values(), *stub_ends], StateType.WAIT)
     _discs(canvas, decisions, StateType.DECISION)
     _discs(canvas, ends, StateType.END)
     _discs(canvas, [home], StateType.HOME)
     _discs(canvas, [fail], StateType.FAIL)
-    _lines(canvas, _cross(fail, size / 60), size / 96, BACKGROUND)
+    _cross(canvas, fail, size / 60, size / 96, BACKGROUND)
     return canvas, marks, waits
 
 
 def _place_all(marks: Places, graph: CTGraph, size: int, gap: float) -> list[MarkLine]:
     """Add every node of a small tree, each level spread over the width. No branch is a stub."""
-    b = graph.branching_factor
+    y = marks[HOME_KEY].y
     for level in range(graph.depth + 1):
         first = graph.first_node(level)
-        width = size / b**level
-        y = marks[HOME_KEY].y + gap * (level + 1)
+        count = graph.branching_factor**level
+        width = size / count
         radius = min(size / 32, 0.3 * gap, 0.39 * width)
-        for i in range(b**level):
-            marks[first + i] = Mark((i + 0.5) * width, y, radius)
+        for i in range(count):
+            marks[first + i] = Mark((i + 0.5) * width, y + gap * (level + 1), radius)
     return []
 
 
@@ -204,11 +213,11 @@ def _place_paths(marks: Places, graph: CTGraph, size: int, gap: float, nodes: tu
     for level in range(1, graph.depth + 1):
         drawn = sorted({path[level] for path in paths if len(path) > level})
         children: dict[int, Places] = {path[level - 1]: {} for path in paths if len(path) >= level}
-        for child in drawn:
+        for child, column in zip(drawn, (0.28 * size, 0.72 * size), strict=False):
             parent = graph.parent(child)
             start = marks[parent]
-            column = start.x if len(drawn) == 1 else size * (0.28 if child == drawn[0] else 0.72)
-            marks[child] = Mark(start.x + min(max(column - start.x, -fan), fan), start.y + gap, radius)
+            shift = column - start.x if len(drawn) > 1 else 0.0
+            marks[child] = Mark(start.x + min(max(shift, -fan), fan), start.y + gap, radius)
             children[parent][graph.decision(child) - 1] = marks[child]
         for parent, known in children.items():
             stubs += _stubs(b, marks[parent], known, gap, min(fan, size / 3 / (b - 1)))
@@ -220,10 +229,12 @@ def _stubs(b: int, parent: Mark, children: Places, gap: float, fan: float) -> li
     known: list[float] = list(children) or [(b - 1) / 2]
     places = [child.x for child in children.values()] or [parent.x]
     stubs = []
-    for branch in sorted({*range(0, b, -(-b // MAX_STUBS))} - {*children}):
-        beyond = min(branch - known[0], 0) + max(branch - known[-1], 0)
-        x = float(np.interp(branch, known, places)) + beyond * fan
-        stubs.append((parent, _middle(parent, Mark(x, parent.y + gap, parent.radius))))
+    for branch in range(0, b, math.ceil(b / MAX_STUBS)):
+        if branch not in children:
+            beyond = min(branch - known[0], 0) + max(branch - known[-1], 0)
+            x = float(np.interp(branch, known, places)) + beyond * fan
+            end = Mark(x, parent.y + gap, parent.radius)
+            stubs.append((parent, _middle(parent, end)))
     return stubs
 
 
@@ -231,19 +242,23 @@ def _middle(a: Mark, z: Mark) -> Mark:
     return Mark((a.x + z.x) / 2, (a.y + z.y) / 2, 0.6 * min(a.radius, z.radius))
 
 
-def _cross(mark: Mark, reach: float) -> list[MarkLine]:
-    return [(Mark(mark.x - x, mark.y - reach, 0), Mark(mark.x + x, mark.y + reach, 0)) for x in (-reach, reach)]
+def _cross(canvas: Pixels, mark: Mark, reach: float, width: float, colour: int) -> None:
+    lines = []
+    for x in (-reach, reach):
+        lines.append((Mark(mark.x - x, mark.y - reach, 0), Mark(mark.x + x, mark.y + reach, 0)))
+    _lines(canvas, lines, width, colour)
 
 
 def _star(canvas: Pixels, mark: Mark, unit: float) -> None:
     """A pentagram below a state, its middle filled."""
     x = mark.x
     y = mark.y + mark.radius + 10.5 * unit
+    reach = 5.5 * unit
     points = []
     for k in range(6):
         turn = 0.8 * math.pi * k
-        points.append(Mark(x + 5.5 * unit * math.sin(turn), y - 5.5 * unit * math.cos(turn), 0))
-    _lines(canvas, list(pairwise(points)), 1.5 * unit, GOAL)
+        points.append(Mark(x + reach * math.sin(turn), y - reach * math.cos(turn), 0))
+    _lines(canvas, pairwise(points), 1.5 * unit, GOAL)
     _discs(canvas, [Mark(x, y, 2 * unit)], GOAL)
 
 
@@ -258,9 +273,15 @@ def _ring(inner: float, outer: float) -> NDArray[np.int64]:
 
 def _fill(canvas: Pixels, centres: NDArray[np.float64], offsets: NDArray[np.int64], colour: int) -> None:
     """Colour the offsets around every centre (x, y) that lie on the canvas; the way goes beneath the states."""
-    points = ((centres * SCALE).round().astype(np.int64)[:, None] + offsets).reshape(-1, 2).T
-    x, y = points[:, (points.min(0) >= 0) & (points.max(0) < len(canvas))]
-    canvas[y, x] = np.where(canvas[y, x] < BACKGROUND, canvas[y, x], colour) if colour == WAY else colour
+    middles = (centres * SCALE).round().astype(np.int64)
+    points = (middles[:, None] + offsets).reshape(-1, 2).T
+    inside = (points.min(0) >= 0) & (points.max(0) < len(canvas))
+    x, y = points[:, inside]
+    if colour == WAY:
+        free = canvas[y, x] >= BACKGROUND
+        x = x[free]
+        y = y[free]
+    canvas[y, x] = colour
 
 
 def _discs(canvas: Pixels, marks: list[Mark], colour: int) -> None:
@@ -269,10 +290,12 @@ def _discs(canvas: Pixels, marks: list[Mark], colour: int) -> None:
         _fill(canvas, circles[circles[:, 2] == radius, :2], _ring(-1, radius), colour)
 
 
-def _lines(canvas: Pixels, lines: list[MarkLine], width: float, colour: int) -> None:
-    ends = np.array(lines)[..., :2]
-    steps = math.ceil(SCALE * abs(ends[:, 1] - ends[:, 0]).max()) + 1
-    points = ends[:, 0] + np.linspace(0, 1, steps)[:, None, None] * (ends[:, 1] - ends[:, 0])
+def _lines(canvas: Pixels, lines: Iterable[MarkLine], width: float, colour: int) -> None:
+    ends = np.array(list(lines))[..., :2]
+    start = ends[:, 0]
+    way = ends[:, 1] - start
+    steps = math.ceil(SCALE * abs(way).max()) + 1
+    points = start + np.linspace(0, 1, steps)[:, None, None] * way
     _fill(canvas, points.reshape(-1, 2), _ring(-1, width / 2), colour)
 
 
@@ -281,4 +304,5 @@ def _to_rgb(canvas: Pixels) -> Pixels:
     packed = np.pad(PALETTE, ((0, 0), (0, 1))).view(np.uint64)[:, 0]
     parts = packed[canvas].reshape(len(canvas) // SCALE, SCALE, -1, SCALE)
     total = parts[:, 0, :, 0] + parts[:, 0, :, 1] + parts[:, 1, :, 0] + parts[:, 1, :, 1]
-    return (total.view(np.uint16).reshape(*total.shape, 4)[..., :3] // SCALE**2).astype(np.uint8)
+    channels = total.view(np.uint16).reshape(*total.shape, 4)[..., :3]
+    return (channels // SCALE**2).astype(np.uint8)

@@ -39,9 +39,10 @@ class TensorEngine:
 
     def step(self, state: RowState, action: Tensor) -> tuple[RowState, Shown]:
         """See `Rows.step`."""
-        words = self._draws.now(state.tick), self._draws.then(state.tick, 1)
-        state, shown = dynamics.step(state, action, self.params, self.uses, words)
-        self._draws.move(state.tick, words[1])
+        now = self._draws.now(state.tick)
+        then = self._draws.then(state.tick, 1)
+        state, shown = dynamics.step(state, action, self.params, self.uses, words=(now, then))
+        self._draws.move(state.tick, then)
         return state, shown
 
     def act(self, state: RowState, action: Tensor) -> tuple[RowState, tuple[Tensor, Tensor]]:
@@ -55,9 +56,12 @@ class TensorEngine:
 
     def step_or_reset(self, state: RowState, action: Tensor, mask: Tensor) -> tuple[RowState, Shown]:
         """See `Rows.step_or_reset`."""
-        words = self._draws.now(state.tick), self._draws.then(state.tick, 1)
-        state, shown = dynamics.step_or_reset(state, action, mask, params=self.params, uses=self.uses, words=words)
-        self._draws.move(state.tick, words[1])
+        now = self._draws.now(state.tick)
+        then = self._draws.then(state.tick, 1)
+        state, shown = dynamics.step_or_reset(
+            state, action, mask, params=self.params, uses=self.uses, words=(now, then)
+        )
+        self._draws.move(state.tick, then)
         return state, shown
 
     def restart(self, state: RowState, mask: Tensor | None, shown: Tensor | None) -> tuple[RowState, Tensor]:

@@ -34,7 +34,8 @@ def philox(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[Tensor, Te
     Returns:
         Four int64 tensors with values in [0, 2**32).
     """
-    return kernel.philox((*counter, *key)) if kernel.takes(*counter, *key) else by_tensors(counter, key)
+    words = (*counter, *key)
+    return kernel.philox(words) if kernel.takes(*words) else by_tensors(counter, key)
 
 
 def by_tensors(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[Tensor, Tensor]) -> tuple[Tensor, ...]:
@@ -77,11 +78,11 @@ def draw(seed: Tensor, row: Tensor, tick: Tensor, stream: int, block: Tensor | i
         block: number of the block in [0, 2**28), for uses that need more than four words.
     """
     last = block + (stream << _STREAM_SHIFT)
-    if not isinstance(last, Tensor):
-        last = torch.full(
-            (), last, dtype=torch.int64, device=tick.device
-        )  # written there: `torch.as_tensor` copies from the CPU
-    return philox((tick & _WORD, tick >> 32, row, last), (seed & _WORD, seed >> 32))
+    if not isinstance(last, Tensor):  # `torch.full` writes on the device, where `torch.as_tensor` copies from the CPU
+        last = torch.full((), last, dtype=torch.int64, device=tick.device)
+    counter = (tick & _WORD, tick >> 32, row, last)
+    key = (seed & _WORD, seed >> 32)
+    return philox(counter, key)
 
 
 _GOLDEN = -0x61C8864680B583EB  # 0x9E3779B97F4A7C15 and the two factors as signed 64-bit integers
@@ -120,7 +121,8 @@ def randint_wide(words: tuple[Tensor, Tensor], high: Tensor) -> Tensor:
     high_upper = high >> 32
     high_lower = high & _WORD
     middle_high, middle_low = _product(upper, high_lower)
-    carry = (_product(lower, high_lower)[0] & _WORD) + middle_low + lower * high_upper
+    low_high, _ = _product(lower, high_lower)
+    carry = (low_high & _WORD) + middle_low + lower * high_upper
     return upper * high_upper + (middle_high & _WORD) + (carry >> 32)
 
 
@@ -142,10 +144,12 @@ def normal(word: Tensor, table: Tensor) -> Tensor:
     The inverse distribution function by linear interpolation in 256 cells per octave of the tail probability. Every
     operation is exact in float64, so devices and compiled code agree bit by bit.
     """
-    tail = ((word >> 1).to(torch.float64) + 0.5).view(torch.int64)  # the bits of a double: octave, cell, place in it
-    cell = (tail >> 44) - (1022 << 8)
-    place = (tail & ((1 << 44) - 1)).to(torch.float64) * 2.0**-44
+    tail = (word >> 1).to(torch.float64) + 0.5
+    bits = tail.view(torch.int64)  # of a double: octave, cell, place in it
+    cell = (bits >> 44) - (1022 << 8)
+    place = (bits & ((1 << 44) - 1)).to(torch.float64) * 2.0**-44
     low = table[cell]
     high = table[cell + 1]
-    size = ((low + (high - low) * place) / _NORMAL_UNIT).round() * _NORMAL_UNIT
+    size = low + (high - low) * place
+    size = (size / _NORMAL_UNIT).round() * _NORMAL_UNIT
     return torch.where((word & 1).bool(), size, -size)

@@ -28,7 +28,9 @@ def add_noise(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
     """
     if not torch.compiler.is_compiling():
         return _add_noise(images, start, read_noise)
-    return by_pixel(images, start, read_noise) if images.is_cuda else _opaque(images, start, read_noise)
+    if images.is_cuda:
+        return by_pixel(images, start, read_noise)
+    return _opaque(images, start, read_noise)
 
 
 _NOISE_ROWS = 4096  # as many rows at once keep the work in the cache
@@ -55,8 +57,10 @@ def noisy(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
     """`add_noise` in one piece."""
     pixels = images[0].numel()
     high = (read_noise + 1).to(torch.int32).unsqueeze(-1)
-    bits = splitmix64(start, (pixels + 3) // 4).view(torch.uint16)[:, :pixels].to(torch.int32)
-    noise = bits.mul_(high).bitwise_right_shift_(16).to(torch.uint8)
+    words = splitmix64(start, (pixels + 3) // 4).view(torch.uint16)  # four of each number
+    noise = words[:, :pixels].to(torch.int32)
+    noise.mul_(high).bitwise_right_shift_(16)
+    noise = noise.to(torch.uint8)
     return add_saturating(images, noise.view_as(images))
 
 
@@ -65,8 +69,10 @@ def by_pixel(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
     start = start.unsqueeze(-1)
     high = (read_noise + 1).long().unsqueeze(-1)
     pixel = torch.arange(images[0].numel(), device=images.device) + (start & 0)  # [N, pixels]: a faster kernel
-    bits = (splitmix64_at(start, pixel // 4) >> pixel % 4 * 16) & 0xFFFF
-    return add_saturating(images, (bits * high >> 16).to(torch.uint8).view_as(images))
+    numbers = splitmix64_at(start, pixel // 4)
+    words = (numbers >> pixel % 4 * 16) & 0xFFFF
+    noise = (words * high >> 16).to(torch.uint8)
+    return add_saturating(images, noise.view_as(images))
 
 
 # Inductor of torch 2.13 writes beyond its buffers on a CPU when it fuses `noisy` with what comes before it, and in C++
@@ -80,8 +86,10 @@ def noise_bank(levels: tuple[int, ...], size: int, shape: tuple[int, ...]) -> Te
     numbers = torch.arange(len(levels) * size, device="cpu")
     zero = numbers.new_tensor(0)
     upper, lower, *_ = draw(zero, numbers, zero, STREAM_NOISE)
+    start = (upper << 32) | lower
     black = torch.zeros(len(numbers), *shape, dtype=torch.uint8, device="cpu")
-    return add_noise(black, (upper << 32) | lower, numbers.new_tensor(levels).repeat_interleave(size))
+    read_noise = numbers.new_tensor(levels).repeat_interleave(size)
+    return add_noise(black, start, read_noise)
 
 
 def add_saturating(images: Tensor, noise: Tensor) -> Tensor:
@@ -140,5 +148,6 @@ def turn(images: Tensor, angle: Tensor, taps: tuple[Tensor, Tensor]) -> Tensor:
     weight = taps[1][angle]
     pixels = images.flatten(1).to(torch.int64)
     sources = pixels.gather(1, index.flatten(1)).view(index.shape)
-    rounded = ((sources * weight).sum(-1) + (1 << 15)) >> 16
+    sums = (sources * weight).sum(-1)
+    rounded = (sums + (1 << 15)) >> 16
     return rounded.to(torch.uint8).view(images.shape)

@@ -24,8 +24,10 @@ def rotate(images: Tensor, degrees: int) -> Tensor:
     if degrees % 360 == 0:
         return images
     index, weight = compute_taps(images.shape[-1], degrees)
-    taps = images.flatten(1).to(torch.int64)[:, index]
-    return (((taps * weight).sum(-1) + (1 << 15)) >> 16).to(torch.uint8).view_as(images)
+    pixels = images.flatten(1).to(torch.int64)
+    sums = (pixels[:, index] * weight).sum(-1)
+    rounded = (sums + (1 << 15)) >> 16
+    return rounded.to(torch.uint8).view_as(images)
 
 
 @lru_cache(maxsize=512)
@@ -43,10 +45,12 @@ def compute_taps(size: int, degrees: int) -> tuple[Tensor, Tensor]:
         for step_x in (0, 1):
             tap_y = source_y.floor() + step_y
             tap_x = source_x.floor() + step_x
-            weight = (1 - (source_y - tap_y).abs()) * (1 - (source_x - tap_x).abs())
             inside = (tap_y >= 0) & (tap_y < size) & (tap_x >= 0) & (tap_x < size)
-            taps.append((tap_y * size + tap_x).where(inside, 0.0).long().flatten())
-            weights.append((weight.where(inside, 0.0) * 2**16).round().long().flatten())
+            tap = tap_y * size + tap_x
+            weight = (1 - (source_y - tap_y).abs()) * (1 - (source_x - tap_x).abs())
+            weight = (weight * 2**16).round()
+            taps.append(tap.where(inside, 0.0).long().flatten())
+            weights.append(weight.where(inside, 0.0).long().flatten())
     return torch.stack(taps, -1), torch.stack(weights, -1)
 
 
