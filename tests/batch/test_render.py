@@ -175,6 +175,22 @@ def test_a_failed_row_shows_where_it_failed():
     assert len(pictures) == len(decisions)
 
 
+def test_a_cross_of_the_colour_of_failure_is_where_a_row_failed():
+    tree = slice(FAIL_CORNER[0].stop, None)
+
+    failed, there = (halves(draw(SMALL, kind, (1,)))[1][tree] for kind in (StateType.FAIL, StateType.DECISION))
+
+    assert count(failed, STATE_COLOURS[StateType.FAIL]) > 10
+    assert count(there, STATE_COLOURS[StateType.FAIL]) == 0
+
+
+def test_the_way_to_a_position_goes_beneath_the_states_that_it_passes():
+    at_home, at_end = (halves(draw(SMALL, *place))[1] for place in ((StateType.HOME,), (StateType.END, (2, 1))))
+
+    for kind in (StateType.WAIT, StateType.DECISION):
+        assert count(at_home, STATE_COLOURS[kind]) == count(at_end, STATE_COLOURS[kind])
+
+
 def test_a_tree_of_depth_30_shows_one_path_to_the_goal_and_one_to_the_position():
     on_the_way, astray = DEEP.goal[:10], (*DEEP.goal[:5], 2, 1, 1, 3, 2)
 

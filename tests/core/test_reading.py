@@ -23,6 +23,7 @@ from helpers.oracles import (
 )
 
 from ctgraph_rl import CTGraph, CTGraphEnv, Observations, OneHot, PaperImages, StateType, Task
+from ctgraph_rl.core.reading import noise_bank
 from ctgraph_rl.core.rotation import rotate
 
 
@@ -162,3 +163,11 @@ def test_both_ids_of_a_range_of_two_are_shown_where_nothing_else_is_random(kind)
     shown = torch.stack(ids).unique().tolist()
     passed = [HOME, WAIT, DECISION, FAIL if kind == FAIL else END]
     assert shown == sorted([2 * each for each in passed] + [2 * kind + 1])
+
+
+def test_noise_drawn_in_advance_lies_by_its_largest_addition():
+    none, little, much = noise_bank((0, 4, 200), 300, (1, 5, 5)).chunk(3)
+
+    assert none.max() == 0
+    assert little.max() == 4
+    assert much.max() == 200
