@@ -233,3 +233,7 @@ def test_a_test_that_imports_a_test_is_found(text):
     found = read({"tests.test_a": text, "tests.test_b": "import pytest\nfrom helpers import oracles", "conftest": ""})
 
     assert [finding.partition(":")[0] for finding in architecture.tests_that_import_tests(found)] == ["tests.test_a"]
+
+
+def test_an_f_string_is_one_token_on_every_python():
+    assert list(architecture.lines_of_tokens('a = f"{x + 1:{w}} b" f"""{y}\n{z}"""\nb\n')) == [1, 1, 1, 1, 3]

@@ -10,6 +10,7 @@ import io
 import re
 import tokenize
 from bisect import bisect_left, bisect_right
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -19,6 +20,7 @@ from helpers.paths import CHECKOUT
 
 PACKAGES = ("ctgraph_rl", "curricula", "baselines", "benchmarks", "hydra_plugins")
 RESULTS = CHECKOUT / "docs" / "results"
+FUNCTION = (ast.FunctionDef, ast.AsyncFunctionDef)
 BY_NAME = ("import_module", "find_spec", "__import__")
 """Functions that import, or look for, a module by its name."""
 
@@ -217,7 +219,7 @@ def _module(name: str, text: str, is_module: Callable[[str], bool], with_bodies:
     )
     if not with_bodies:
         return found
-    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+    functions = [node for node in ast.walk(tree) if isinstance(node, FUNCTION)]
     return replace(
         found,
         functions=tuple(_sizes_of_functions(functions, text)),
@@ -226,7 +228,7 @@ def _module(name: str, text: str, is_module: Callable[[str], bool], with_bodies:
     )
 
 
-def _starred_dicts(functions: Iterable[ast.FunctionDef | ast.AsyncFunctionDef]) -> Iterator[str]:
+def _starred_dicts(functions: Iterable[ast.FunctionDef]) -> Iterator[str]:
     """Functions that star a dict of literal keys into a call, but for those that set other items of it."""
     for function in functions:
         nodes = list(ast.walk(function))
@@ -269,12 +271,18 @@ def _public_classes(tree: ast.Module) -> Iterator[str]:
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 
 
-def _sizes_of_functions(
-    functions: Iterable[ast.FunctionDef | ast.AsyncFunctionDef], text: str
-) -> list[tuple[str, int]]:
+def lines_of_tokens(text: str) -> Iterator[int]:
+    """The line of each token of code. An f-string is one token, also where Python 3.12 and newer give its parts."""
+    depth = 0
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type not in NO_CODE and depth == 0:
+            yield token.start[0]
+        depth += {"FSTRING_START": 1, "FSTRING_END": -1}.get(tokenize.tok_name[token.type], 0)
+
+
+def _sizes_of_functions(functions: Iterable[ast.FunctionDef], text: str) -> list[tuple[str, int]]:
     """Functions and the number of tokens in their bodies."""
-    tokens = tokenize.generate_tokens(io.StringIO(text).readline)
-    lines = [token.start[0] for token in tokens if token.type not in NO_CODE]
+    lines = list(lines_of_tokens(text))
     sizes = []
     for node in functions:
         body = node.body if ast.get_docstring(node) is None else node.body[1:]
@@ -418,12 +426,9 @@ def imported_by_name(modules: Iterable[Module], doors: Iterable[str]) -> list[st
 
 def full_folders(modules: Iterable[Module], most: int, catalogues: Iterable[str]) -> list[str]:
     """Folders besides catalogues of more modules than allowed; their ``__init__`` does not count."""
-    folders = [module.folder for module in modules if not module.is_folder]
-    return sorted(
-        f"{folder}: {folders.count(folder)} modules"
-        for folder in set(folders) - set(catalogues)
-        if folders.count(folder) > most
-    )
+    sizes = Counter(module.folder for module in modules if not module.is_folder)
+    full = {folder: size for folder, size in sizes.items() if size > most and folder not in catalogues}
+    return sorted(f"{folder}: {size} modules" for folder, size in full.items())
 
 
 def long_files(modules: Iterable[Module], most: int, exceptions: Iterable[str]) -> list[str]:

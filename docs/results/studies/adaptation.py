@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import fsum
 from pathlib import Path
+from statistics import fmean
 from string import Template
 from typing import TYPE_CHECKING, Any
 
@@ -108,19 +110,19 @@ def first(lines: Raw) -> float:
 def adapted(lines: Raw) -> float:
     """Return the mean success of a run's episodes after the adaptation."""
     after = [float(line["success"]) for line in lines if int(line["episode"]) > int(line["adapt_episodes"])]
-    return sum(after) / len(after)
+    return fmean(after)
 
 
 def regret(lines: Raw) -> float:
     """Return the goals that a run's rows miss beside the best search, in all of their episodes."""
-    return sum(float(line["best_search"]) - float(line["success"]) for line in lines)
+    return fsum(float(line["best_search"]) - float(line["success"]) for line in lines)
 
 
 def bounds_of_regret(lines: Raw) -> Bounds:
     """Return 0 and the regret of an agent that never gets to the goal; sampled episodes may do better than 0."""
     from ctgraph_rl.report.intervals import Bounds
 
-    return Bounds(0.0, sum(float(line["best_search"]) for line in lines), noisy=True)
+    return Bounds(0.0, fsum(float(line["best_search"]) for line in lines), noisy=True)
 
 
 def successes(depth: int, kind: str = FULL) -> dict[str, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from studies.raw import groups, lines_of_runs, machine_of, mean_of, read, table, write
@@ -63,7 +64,7 @@ def measured(run: Path) -> list[dict[str, Any]]:
 def shares(agent: str, held_out: bool) -> list[float]:
     """Return the share of episodes at the goal of each seed: of lives with a swap, held out, or with one goal."""
     lines = [line for line in read(NAME) if (line["agent"], line["held_out"]) == (agent, str(held_out))]
-    return [sum(float(line["success"]) for line in of) / len(of) for of in groups(lines, "seed").values()]
+    return [fmean(float(line["success"]) for line in of) for of in groups(lines, "seed").values()]
 
 
 def swap_table() -> str:
