@@ -8,14 +8,13 @@ from typing import Any
 import torch
 from tensordict import LazyStackedTensorDict, TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from ctgraph_rl.batch.assignment import checked_num_ids, one_hot_ids
 from ctgraph_rl.batch.native import Stepped
 from ctgraph_rl.batch.render import render
 from ctgraph_rl.batch.rows import Rows
-from ctgraph_rl.batch.specs import specs_of
+from ctgraph_rl.batch.specs import done_spec, reward_spec, specs_of
 from ctgraph_rl.checks import require, require_all, takes_numbers, true_or_false
 from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.device import checked_device
@@ -113,14 +112,11 @@ class CTGraphEnv(EnvBase):
         self._make_specs()
 
     def _make_specs(self) -> None:
-        rows = self.batch_size
-        device = self.device
-        specs = specs_of(self.rows.pool, rows, self.num_task_ids, self.info)
-        self.observation_spec, self.action_spec = (spec.to(device) for spec in specs)
-        self.reward_spec = Unbounded(shape=(*rows, 1), dtype=torch.float32, device=device)
-        flag = Binary(1, shape=(*rows, 1), dtype=torch.bool, device=device)
-        truncated = {"truncated": flag.clone()} if self.info else {}
-        self.full_done_spec = Composite(done=flag, terminated=flag.clone(), **truncated, shape=rows, device=device)
+        specs = specs_of(self.rows.pool, self.batch_size, self.num_task_ids, self.info)
+        self.observation_spec = specs.observation.to(self.device)
+        self.action_spec = specs.action.to(self.device)
+        self.reward_spec = reward_spec(self.batch_size).to(self.device)
+        self.full_done_spec = done_spec(self.batch_size, truncated=self.info).to(self.device)
 
     @property
     def tasks(self) -> tuple[Task, ...]:

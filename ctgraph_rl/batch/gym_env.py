@@ -12,11 +12,12 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn.functional import one_hot
-from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.data import Bounded, Categorical, Unbounded
 from torchrl.envs import EnvBase
 
 from ctgraph_rl.batch.assignment import checked_num_ids, one_hot_ids
 from ctgraph_rl.batch.rows import seed_rule
+from ctgraph_rl.batch.specs import done_spec, observation_spec, reward_spec
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule, require, require_all
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import beside
@@ -71,8 +72,7 @@ class GymEnv(EnvBase):
         self.seed = seed
         self.tasks = tasks
         self._ids = {} if task_ids is None else dict(task_ids)
-        self._made: list[dict[GymTask, Any]] = [{} for _ in tasks]
-        self._next: tuple[GymTask, ...] | None = None
+        self._next = tasks
         self._episode = np.full(count, -1, dtype=np.int64)
         self._actions: list[list[Any]] = [[] for _ in tasks]
         self._rows = SyncVectorEnv(
@@ -81,28 +81,17 @@ class GymEnv(EnvBase):
             observation_mode="different",
             copy=False,
         )
-        for made, task, env in zip(self._made, tasks, self._rows.envs, strict=True):
-            made[task] = env
+        self._made = [{task: env} for task, env in zip(tasks, self._rows.envs, strict=True)]
         self._make_specs()
 
     def _make_specs(self) -> None:
-        n = self.batch_size[0]
-        column = (n, 1)
-        shown = _observation_spec(spaces_of(self.pool[0])[0], (n, *self.pool[0].observation_shape))
-        flag = Binary(1, shape=column, dtype=torch.bool, device="cpu")
-        keys = {
-            "observation": shown,
-            "is_init": flag.clone(),
-            "step_count": Unbounded(shape=column, dtype=torch.int64, device="cpu"),
-            "episode_reward": Unbounded(shape=column, dtype=torch.float32, device="cpu"),
-        }
-        if self.num_task_ids:
-            keys["task_id"] = Bounded(0, 1, shape=(n, self.num_task_ids), dtype=torch.uint8, device="cpu")
-        self.observation_spec = Composite(keys, shape=(n,), device="cpu").to(self.device)
-        self.action_spec = _action_spec(spaces_of(self.pool[0])[1], n).to(self.device)
-        self.reward_spec = Unbounded(shape=column, dtype=torch.float32, device="cpu").to(self.device)
-        done = {"done": flag, "terminated": flag.clone(), "truncated": flag.clone()}
-        self.full_done_spec = Composite(done, shape=(n,), device="cpu").to(self.device)
+        rows = self.batch_size
+        observed, acted = spaces_of(self.pool[0])
+        seen = _spec_of_observations(observed, (*rows, *self.pool[0].observation_shape))
+        self.observation_spec = observation_spec(seen, rows, self.num_task_ids).to(self.device)
+        self.action_spec = _spec_of_actions(acted, rows).to(self.device)
+        self.reward_spec = reward_spec(rows).to(self.device)
+        self.full_done_spec = done_spec(rows).to(self.device)
         self._data = {**self.observation_spec.zero(), **self.full_done_spec.zero()}
 
     def set_tasks(self, tasks: Iterable[GymTask], at_episode_end: bool = False) -> None:
@@ -117,21 +106,21 @@ class GymEnv(EnvBase):
             (len(tasks) == len(self.tasks), f"tasks must be one for each of {len(self.tasks)} rows, got {len(tasks)}"),
             (not unknown, f"tasks must be of task_pool, got {unknown[:1]}"),
         )
-        if at_episode_end:
-            self._next = tasks
-        else:
-            self.tasks = tasks
-            self._next = None
+        self._next = tasks
+        if not at_episode_end:
             self._place(range(len(tasks)))
 
     def _place(self, rows: Iterable[int]) -> None:
-        """Put the environments of the rows' tasks in their places; each is made once."""
+        """Give rows their next tasks, and put the environments of these in place; each is made once."""
+        tasks = list(self.tasks)
         for row in rows:
             made = self._made[row]
-            task = self.tasks[row]
+            task = self._next[row]
             if task not in made:
                 made[task] = task.make()
             self._rows.envs[row] = made[task]
+            tasks[row] = task
+        self.tasks = tuple(tasks)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
         given = None if tensordict is None else tensordict.get("_reset", None)
@@ -139,12 +128,7 @@ class GymEnv(EnvBase):
         if given is not None and (self._episode >= 0).all():
             mask = given.view(-1).cpu().numpy()
         rows = np.flatnonzero(mask).tolist()
-        if self._next is not None:
-            tasks = list(self.tasks)
-            for row in rows:
-                tasks[row] = self._next[row]
-            self.tasks = tuple(tasks)
-            self._place(rows)
+        self._place(rows)
         self._episode[mask] += 1
         seeds: list[int | None] = [None] * len(mask)
         for row in rows:
@@ -154,8 +138,8 @@ class GymEnv(EnvBase):
         begun = torch.from_numpy(mask).to(self.device).unsqueeze(-1)
         data = self._observed(observations)
         for key, value in self._data.items():
-            given_up = data[key] if key in data else torch.zeros_like(value)
-            data[key] = torch.where(beside(begun, value), given_up, value)
+            first = data[key] if key in data else torch.zeros_like(value)
+            data[key] = torch.where(beside(begun, value), first, value)
         data["is_init"] = begun
         return self._shown(data)
 
@@ -188,7 +172,8 @@ class GymEnv(EnvBase):
         space = spaces_of(self.pool[0])[0]
         seen = torch.from_numpy(np.array(observations)).to(self.device)
         if hasattr(space, "n"):
-            seen = one_hot(seen.long() - int(space.start), shape[0]).to(torch.uint8)
+            numbers = seen.long() - int(space.start)
+            seen = one_hot(numbers, shape[0]).to(torch.uint8)
         elif space.dtype == np.uint8:
             seen = seen.permute(0, 3, 1, 2) if seen.ndim == 4 else seen.view(-1, *shape)
         else:
@@ -219,10 +204,9 @@ class GymEnv(EnvBase):
 
     def state_dict(self, *args: Any, **kwargs: Any) -> NamedValues:
         """Return what `load_state_dict` needs to continue: each row's task, episode and actions, and the shown data."""
-        following = self.tasks if self._next is None else self._next
         return {
             "tasks": self._numbers(self.tasks),
-            "next_tasks": self._numbers(following),
+            "next_tasks": self._numbers(self._next),
             "episode": torch.from_numpy(self._episode.copy()),
             "actions": [torch.from_numpy(np.array(played)) for played in self._actions],
             "data": dict(self._data),
@@ -240,20 +224,20 @@ class GymEnv(EnvBase):
         Raises:
             ValueError: if a row then does not show what it showed.
         """
-        self.tasks = self._numbered(state_dict["tasks"])
+        rows = range(len(self.tasks))
+        self._next = self._numbered(state_dict["tasks"])
+        self._place(rows)
         self._next = self._numbered(state_dict["next_tasks"])
         self._episode = state_dict["episode"].numpy().copy()
         kept = all(task.repeats for task in self.tasks)
-        self._place(range(len(self.tasks)))
-        seeds: list[int | None] = []
-        for row, played in enumerate(state_dict["actions"]):
-            self._actions[row] = list(played.numpy()) if kept else []
-            seeds.append(self._episode_seed(row))
+        self._actions = [list(played.numpy()) if kept else [] for played in state_dict["actions"]]
+        seeds: list[int | None] = [self._episode_seed(row) for row in rows]
         begun, _ = self._rows.reset(seed=seeds, options={"reset_mask": np.ones(len(seeds), dtype=bool)})
         found = np.array(begun)
-        for row, (env, played) in enumerate(zip(self._rows.envs, self._actions, strict=True)):
-            for action in played:
-                found[row] = env.step(self._as_given(np.asarray([action]))[0])[0]
+        for row in rows:
+            for action in self._actions[row]:
+                [given] = self._as_given(np.asarray([action]))
+                found[row], *_ = self._rows.envs[row].step(given)
         self._data = {key: value.to(self.device) for key, value in state_dict["data"].items()}
         same = self._observed(found)["observation"].equal(self._data["observation"])
         require(
@@ -264,7 +248,7 @@ class GymEnv(EnvBase):
 FIX = "make reset(seed=...) decide all of an episode, or give GymTask(repeats=False)"
 
 
-def _observation_spec(space: Any, shape: tuple[int, ...]) -> Any:
+def _spec_of_observations(space: Any, shape: tuple[int, ...]) -> Any:
     if hasattr(space, "n"):
         return Bounded(0, 1, shape=shape, dtype=torch.uint8, device="cpu")
     if space.dtype == np.uint8:
@@ -272,10 +256,10 @@ def _observation_spec(space: Any, shape: tuple[int, ...]) -> Any:
     return Unbounded(shape=shape, dtype=torch.float32, device="cpu")
 
 
-def _action_spec(space: Any, num_rows: int) -> Any:
+def _spec_of_actions(space: Any, rows: torch.Size) -> Any:
     if hasattr(space, "n"):
-        return Categorical(int(space.n), shape=(num_rows,), dtype=torch.int64, device="cpu")
-    shape = (num_rows, *space.shape)
+        return Categorical(int(space.n), shape=rows, dtype=torch.int64, device="cpu")
+    shape = (*rows, *space.shape)
     ends = np.stack([space.low, space.high])
     if not np.isfinite(ends).all():
         return Unbounded(shape=shape, dtype=torch.float32, device="cpu")
@@ -285,12 +269,14 @@ def _action_spec(space: Any, num_rows: int) -> Any:
 
 def _same_spaces(pool: Sequence[GymTask]) -> Rule:
     """Return the rule that tasks can be rows of one environment."""
-    kinds = {}
+    forms = []
     for task in pool:
         observed, acted = spaces_of(task)
-        kinds[observed.dtype, task.observation_shape, str(acted)] = task.id
-    shown = ", ".join(f"{dtype} {list(shape)} with actions {actions}" for dtype, shape, actions in kinds)
-    return len(kinds) == 1, f"tasks of one environment must have observations and actions of one form, got {shown}"
+        form = f"{observed.dtype} {list(task.observation_shape)} with actions {acted}"
+        if form not in forms:
+            forms.append(form)
+    rule = f"tasks of one environment must have observations and actions of one form, got {', '.join(forms)}"
+    return len(forms) == 1, rule
 
 
 @cache

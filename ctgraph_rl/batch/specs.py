@@ -1,4 +1,4 @@
-"""The TorchRL specs of an environment for a pool of tasks."""
+"""The TorchRL specs of environments."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Unbounded
 
 from ctgraph_rl.batch.params import observation_shape
 from ctgraph_rl.core.dynamics import OUTCOME_GOAL, OUTCOME_RUNNING
@@ -35,19 +35,50 @@ def specs_of(pool: Sequence[Task], batch_size: tuple[int, ...] = (), num_task_id
         ValueError: for observations of different shapes, and for more than the machine can hold.
     """
     shape = observation_shape(pool, math.prod(batch_size))
-    column = (*batch_size, 1)
     white = 255 if len(shape) == 3 else max(int(white_level(task.images)) for task in pool)
-    keys: dict[str, Bounded | Binary | Unbounded] = {
-        "observation": Bounded(0, white, shape=(*batch_size, *shape), dtype=torch.uint8, device="cpu"),
-        "is_init": Binary(1, shape=column, dtype=torch.bool, device="cpu"),
-    }
-    if info:
-        keys["step_count"] = Unbounded(shape=column, dtype=torch.int64, device="cpu")
-        keys["episode_reward"] = Unbounded(shape=column, dtype=torch.float32, device="cpu")
-        keys["outcome"] = Bounded(OUTCOME_RUNNING, OUTCOME_GOAL, shape=column, dtype=torch.uint8, device="cpu")
-        keys["leaf"] = Unbounded(shape=column, dtype=torch.int64, device="cpu")
-    if num_task_ids:
-        keys["task_id"] = Bounded(0, 1, shape=(*batch_size, num_task_ids), dtype=torch.uint8, device="cpu")
+    image = Bounded(0, white, shape=(*batch_size, *shape), dtype=torch.uint8, device="cpu")
+    observation = observation_spec(image, batch_size, num_task_ids, info=info, ends=info)
     num_actions = 1 + max(task.graph.branching_factor for task in pool)
     action = Categorical(num_actions, shape=batch_size, dtype=torch.int64, device="cpu")
-    return Specs(Composite(keys, shape=batch_size, device="cpu"), action)
+    return Specs(observation, action)
+
+
+def observation_spec(
+    observation: TensorSpec, batch_size: tuple[int, ...], num_task_ids: int, info: bool = True, ends: bool = False
+) -> Composite:
+    """Return the spec of what rows show, on the CPU.
+
+    Args:
+        observation: the spec of their observations.
+        batch_size: see `specs_of`, as for ``num_task_ids``.
+        num_task_ids: length of ``task_id``.
+        info: whether ``step_count`` and ``episode_reward`` are there.
+        ends: whether ``outcome`` and ``leaf`` are there.
+    """
+    column = (*batch_size, 1)
+    number = Unbounded(shape=column, dtype=torch.int64, device="cpu")
+    keys = {"observation": observation, "is_init": _flag(batch_size)}
+    if info:
+        keys["step_count"] = number
+        keys["episode_reward"] = reward_spec(batch_size)
+    if ends:
+        keys["outcome"] = Bounded(OUTCOME_RUNNING, OUTCOME_GOAL, shape=column, dtype=torch.uint8, device="cpu")
+        keys["leaf"] = number.clone()
+    if num_task_ids:
+        keys["task_id"] = Bounded(0, 1, shape=(*batch_size, num_task_ids), dtype=torch.uint8, device="cpu")
+    return Composite(keys, shape=batch_size, device="cpu")
+
+
+def reward_spec(batch_size: tuple[int, ...]) -> Unbounded:
+    """Return the spec of the reward of rows, on the CPU."""
+    return Unbounded(shape=(*batch_size, 1), dtype=torch.float32, device="cpu")
+
+
+def done_spec(batch_size: tuple[int, ...], truncated: bool = True) -> Composite:
+    """Return the spec of the ends of rows' episodes, with or without ``truncated``, on the CPU."""
+    keys = ["done", "terminated", "truncated"] if truncated else ["done", "terminated"]
+    return Composite({key: _flag(batch_size) for key in keys}, shape=batch_size, device="cpu")
+
+
+def _flag(batch_size: tuple[int, ...]) -> Binary:
+    return Binary(1, shape=(*batch_size, 1), dtype=torch.bool, device="cpu")
