@@ -139,6 +139,20 @@ def test_a_restored_environment_goes_on_with_the_same_bits():
         assert all(following[key].equal(data[key]) for key in data.keys(True, True))
 
 
+def test_a_restored_row_still_changes_its_task_where_its_episode_ends():
+    long = GymTask("CartPole-v1", max_episode_steps=500)
+    env, other = (GymEnv([CART] * 2, task_pool=[CART, long]) for _ in range(2))
+    env.reset()
+    env.set_tasks([long] * 2, at_episode_end=True)
+
+    other.load_state_dict(env.state_dict())
+    before = other.tasks
+    other.reset()
+
+    assert before == (CART, CART)
+    assert other.tasks == (long, long)
+
+
 @pytest.mark.parametrize(
     ("tasks", "message"),
     [
