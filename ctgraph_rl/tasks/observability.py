@@ -9,27 +9,21 @@ tree. Levels count decisions: level k has b^k wait states and, below the depth, 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 from ctgraph_rl.checks import Rule, require
 from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.core.rewards import Needle
 from ctgraph_rl.tasks.task import Task
 
-POLICIES: dict[str, Callable[[CTGraph], tuple[float, float, bool]]] = {
-    "random": lambda graph: (
-        1 / (graph.branching_factor + 1),
-        graph.branching_factor / (graph.branching_factor + 1),
-        False,
-    ),
-    "navigation": lambda graph: (1.0, 1.0, False),
-    "optimal": lambda graph: (1.0, 1.0, True),
-}
-"""The policies of section 2.2 of the paper: the probability to wait at a wait state, that to decide at a decision
-state, and whether decisions are those of the goal instead of uniform."""
+POLICIES = ("random", "navigation", "optimal")
+"""The policies of section 2.2 of the paper."""
 
 PLACED = (StateType.WAIT, StateType.DECISION, StateType.END)
 """Kinds of which a graph may have several states."""
+
+Visits = dict[StateType, dict[int, float]]
+"""Expected visits of an episode to the states of each kind, by level."""
 
 
 def states_per_observation(task: Task) -> dict[str, int]:
@@ -67,15 +61,15 @@ def state_entropy(task: Task, policy: str = "random") -> float:
     Raises:
         ValueError: for an unknown policy, and a ``legacy_index`` with more than two branches.
     """
-    require((policy in POLICIES, f"policy must be one of {', '.join(POLICIES)}, got {policy!r}"), _index_rule(task))
-    waits, decides, knows_goal = POLICIES[policy](task.graph)
-    visits = _visits(task.graph, waits, decides)
+    require(_policy_rule(policy), _index_rule(task))
+    visits = _visits(task.graph, *_chances(task.graph, policy))
+    branches = _branches(task.graph, policy)
     open_bits = 0.0
     for kind in PLACED:
         if not task.observations.is_unique(kind):
-            open_bits += _bits(visits[kind], 1 if knows_goal else task.graph.branching_factor)
-    arrived = sum(visits[StateType.END].values())
-    return open_bits / (1 + sum(sum(of_kind.values()) for of_kind in visits.values()) + 1 - arrived)
+            open_bits += _bits(visits[kind], branches)
+    count = _count(visits)
+    return open_bits / (1 + sum(count.values()) + 1 - count[StateType.END])
 
 
 def transition_entropy(task: Task, policy: str = "navigation", informed: bool = True) -> float:
@@ -106,20 +100,21 @@ def transition_entropy(task: Task, policy: str = "navigation", informed: bool = 
     drawn = task.reward_std or task.goal_change or x.read_noise or x.read_rotation or x.reward_cue
     fixed = task.reward_fn == Needle() and not drawn and not task.extra_end_step
     require(
-        (policy in POLICIES, f"policy must be one of {', '.join(POLICIES)}, got {policy!r}"),
+        _policy_rule(policy),
         _index_rule(task),
         (fixed, "the entropy of transitions is exact for a Needle reward, with no noise, change or extra step"),
     )
-    waits, decides, knows_goal = POLICIES[policy](task.graph)
+    waits, decides = _chances(task.graph, policy)
     visits = _visits(task.graph, waits, decides)
-    count = {kind: sum(of_kind.values()) for kind, of_kind in visits.items()}
+    count = _count(visits)
     steps = 1 + count[StateType.WAIT] + count[StateType.DECISION]
-    bits = {kind: 0.0 if x.is_unique(kind) else math.log2(1 + x.ids(kind)[1] - x.ids(kind)[0]) for kind in StateType}
+    bits = {kind: _drawn_bits(task, kind) for kind in StateType}
     if not informed:
-        return _pair_bits(visits, bits, task, knows_goal) / steps
+        return _pair_bits(visits, bits, task, _branches(task.graph, policy)) / steps
     wait = bits[StateType.WAIT]
     fail = bits[StateType.FAIL]
-    stay = sum(-share * math.log2(share) for share in (p, 1 - p) if share) + p * wait
+    leaving = sum(-share * math.log2(share) for share in (p, 1 - p) if share)
+    stay = leaving + p * wait
     total = wait + count[StateType.DECISION] * (decides * wait + (1 - decides) * fail)
     for level, v in visits[StateType.WAIT].items():
         onward = bits[StateType.END if level == task.graph.depth else StateType.DECISION]
@@ -127,34 +122,52 @@ def transition_entropy(task: Task, policy: str = "navigation", informed: bool = 
     return total / steps
 
 
-def _pair_bits(
-    visits: Mapping[StateType, dict[int, float]], bits: Mapping[StateType, float], task: Task, knows_goal: bool
-) -> float:
+def _drawn_bits(task: Task, kind: StateType) -> float:
+    """log2 of the ids that a state of a kind draws from."""
+    if task.observations.is_unique(kind):
+        return 0.0
+    first, last = task.observations.ids(kind)
+    return math.log2(1 + last - first)
+
+
+def _pair_bits(visits: Visits, bits: Mapping[StateType, float], task: Task, branches: int) -> float:
     """-sum over pairs of c log2(c / n), where a pair of observation and reward comes c times in an episode's n steps.
 
     Equal pairs are one group, (their expected number together, log2 of how many there are).
     """
-    b = 1 if knows_goal else task.graph.branching_factor
-    arrived = sum(visits[StateType.END].values())
-    goal = 1.0 if task.observations.is_unique(StateType.END) else b**-task.graph.depth
-    groups = [(1 - arrived, bits[StateType.FAIL])]
+    count = _count(visits)
+    goal = branches**-task.graph.depth
+    groups = [(1 - count[StateType.END], bits[StateType.FAIL])]
     for kind, by_level in visits.items():
         if task.observations.is_unique(kind):
             for level, v in by_level.items():
-                groups.append((v, level * math.log2(b)))
+                groups.append((v, level * math.log2(branches)))
         else:
             shares = (goal, 1 - goal) if kind == StateType.END else (1.0,)
             for share in shares:
-                groups.append((share * sum(by_level.values()), bits[kind]))
+                groups.append((share * count[kind], bits[kind]))
     total = sum(count for count, _ in groups)
     return sum(count * (wide - math.log2(count / total)) for count, wide in groups if count > 0)
 
 
-def _visits(graph: CTGraph, waits: float, decides: float) -> dict[StateType, dict[int, float]]:
+def _chances(graph: CTGraph, policy: str) -> tuple[float, float]:
+    """The probability that a policy waits at a wait state, and that it decides at a decision state."""
+    if policy != "random":
+        return 1.0, 1.0
+    b = graph.branching_factor
+    return 1 / (b + 1), b / (b + 1)
+
+
+def _branches(graph: CTGraph, policy: str) -> int:
+    """How many branches of a decision state a policy takes, each as often."""
+    return 1 if policy == "optimal" else graph.branching_factor
+
+
+def _visits(graph: CTGraph, waits: float, decides: float) -> Visits:
     """Expected visits of each kind of state by level; home has one visit, and the fail state the rest of the ends."""
     p = graph.wait_prob
     leaves = waits * (1 - p) / (1 - waits * p)
-    visits: dict[StateType, dict[int, float]] = {kind: {} for kind in PLACED}
+    visits: Visits = {kind: {} for kind in PLACED}
     for level in range(graph.depth + 1):
         reached = (leaves * decides) ** level
         visits[StateType.WAIT][level] = reached / (1 - waits * p)
@@ -163,10 +176,19 @@ def _visits(graph: CTGraph, waits: float, decides: float) -> dict[StateType, dic
     return visits
 
 
+def _count(visits: Visits) -> dict[StateType, float]:
+    """Expected visits of each kind of state."""
+    return {kind: sum(by_level.values()) for kind, by_level in visits.items()}
+
+
 def _bits(by_level: dict[int, float], branches: int) -> float:
     """-sum_s v(s) log2(v(s) / v) for levels whose ``branches``^level states are visited equally often."""
     total = sum(by_level.values())
     return sum(v * (level * math.log2(branches) - math.log2(v / total)) for level, v in by_level.items() if v > 0)
+
+
+def _policy_rule(policy: str) -> Rule:
+    return policy in POLICIES, f"policy must be one of {', '.join(POLICIES)}, got {policy!r}"
 
 
 def _index_rule(task: Task) -> Rule:
