@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import torch
@@ -21,26 +22,34 @@ from ctgraph_rl.tasks.images import white_level
 from ctgraph_rl.tasks.memory import BankKey, bank_bytes, bank_key, make_bank, rotates_after_noise
 from ctgraph_rl.tasks.task import Task
 
+TaskValue = str | Callable[[Task], Any]
+
 
 @dataclass(frozen=True)
 class _Different:
-    """Different tasks, and tensors with an entry for each of them."""
+    """Different tasks, and tensors with an entry for each of them.
+
+    A value of a task is one of its attributes, by name, or what a function says of it.
+    """
 
     tasks: tuple[Task, ...]
     device: torch.device
 
-    def each(self, value: Callable[[Task], Any], dtype: torch.dtype = torch.int64) -> Tensor:
+    def each(self, value: TaskValue, dtype: torch.dtype = torch.int64) -> Tensor:
         """Return the value of each task."""
-        return torch.tensor([value(task) for task in self.tasks], dtype=dtype, device=self.device)
+        return torch.tensor(list(self._values(value)), dtype=dtype, device=self.device)
 
     def each_kind(self, number: Callable[[Task, StateType], int]) -> Tensor:
         """Return a number for each kind of state of each task, flattened."""
         numbers = [number(task, kind) for task in self.tasks for kind in StateType]
         return torch.tensor(numbers, dtype=torch.int64, device=self.device)
 
-    def some(self, holds: Callable[[Task], object]) -> bool:
-        """Return whether something holds for a task at least."""
-        return any(holds(task) for task in self.tasks)
+    def some(self, value: TaskValue) -> bool:
+        """Return whether the value of some task is neither false nor 0 nor None."""
+        return any(self._values(value))
+
+    def _values(self, value: TaskValue) -> Iterator[Any]:
+        return map(attrgetter(value) if isinstance(value, str) else value, self.tasks)
 
     @property
     def max_depth(self) -> int:
@@ -81,7 +90,7 @@ def make_tables(tasks: tuple[Task, ...], number: Tensor, bank: Bank) -> Tables:
         tree=_tree_params(different),
         x=_observation_params(different, bank),
         g=_reward_params(different, reward_fns),
-        goal_leaf=different.each(lambda task: task.goal_leaf),
+        goal_leaf=different.each("goal_leaf"),
         uses=_uses(different, bank, reward_fns),
         number=number,
         entry=number[:0],
@@ -90,40 +99,40 @@ def make_tables(tasks: tuple[Task, ...], number: Tensor, bank: Bank) -> Tables:
 
 def _uses(tasks: _Different, bank: Bank, reward_fns: tuple[RewardFn, ...]) -> Uses:
     some = tasks.some
-    pixel_noise = some(lambda task: task.observations.read_noise)
+    pixel_noise = some("observations.read_noise")
     return Uses(
         waits=some(lambda task: task.graph.wait_prob > 0),
         unique_ids=some(lambda task: any(_is_by_node(task, kind) for kind in StateType)),
-        drawn_ids=some(lambda task: task.observations.draws_ids),
+        drawn_ids=some("observations.draws_ids"),
         views=some(lambda task: _num_views(task) * _num_angles(task) > 1),
         pixel_noise=pixel_noise,
         noise_bank=bank.num_noises if pixel_noise else 0,
-        reward_noise=some(lambda task: task.reward_std),
+        reward_noise=some("reward_std"),
         multiplicative=some(lambda task: task.reward_std and task.reward_noise == "multiplicative"),
-        fail_reward=some(lambda task: task.fail_reward),
-        step_reward=some(lambda task: task.step_reward),
-        reward_cue=some(lambda task: task.observations.reward_cue),
-        goal_change=some(lambda task: task.goal_change),
+        fail_reward=some("fail_reward"),
+        step_reward=some("step_reward"),
+        reward_cue=some("observations.reward_cue"),
+        goal_change=some("goal_change"),
         max_depth=tasks.max_depth,
         reward_fns=reward_fns,
     )
 
 
 def _tree_params(tasks: _Different) -> TreeParams:
-    extra_end_step = tasks.each(lambda task: task.extra_end_step, torch.bool)
+    extra_end_step = tasks.each("extra_end_step", torch.bool)
     return tree_params(
-        branching_factor=tasks.each(lambda task: task.graph.branching_factor),
-        first_leaf=tasks.each(lambda task: task.graph.num_decision_states),
+        branching_factor=tasks.each("graph.branching_factor"),
+        first_leaf=tasks.each("graph.num_decision_states"),
         stay_below=tasks.each(lambda task: int(task.graph.wait_prob * 2**63)),
-        extra_end_step=extra_end_step if tasks.some(lambda task: task.extra_end_step) else None,
-        swap=_swap(tasks) if tasks.some(lambda task: task.swapped_branches) else None,
+        extra_end_step=extra_end_step if tasks.some("extra_end_step") else None,
+        swap=_swap(tasks) if tasks.some("swapped_branches") else None,
     )
 
 
 def _swap(tasks: _Different) -> Swap:
-    branches = tasks.each(lambda task: task.swapped_branches[1] if task.swapped_branches else (0, 0))
     node = tasks.each(lambda task: -1 if task.swapped_node is None else task.swapped_node)
-    return Swap(node, branches[:, 0], branches[:, 1])
+    branches = tasks.each(lambda task: task.swapped_branches[1] if task.swapped_branches else (0, 0))
+    return Swap(node, *branches.unbind(1))
 
 
 def _observation_params(tasks: _Different, bank: Bank) -> ObservationParams:
@@ -145,21 +154,22 @@ def _observation_params(tasks: _Different, bank: Bank) -> ObservationParams:
         bank_start=each(lambda task: bank.start[bank_key(task)]),
         num_views=each(_num_views),
         num_angles=each(_num_angles),
-        read_noise=each(lambda task: task.observations.read_noise),
-        reward_cue=each(lambda task: task.observations.reward_cue, torch.bool),
-        cue_wraps=each(lambda task: task.observations.cue_wraps, torch.bool),
+        read_noise=each("observations.read_noise"),
+        reward_cue=each("observations.reward_cue", torch.bool),
+        cue_wraps=each("observations.cue_wraps", torch.bool),
         cue_element=each(lambda task: task.images.shape[-1] - 1),
         white=each(lambda task: white_level(task.images), torch.float64),
         noise_start=each(first_noise),
-        legacy=_legacy_index(tasks) if tasks.some(lambda task: task.observations.legacy_index) else None,
+        legacy=_legacy_index(tasks) if tasks.some("observations.legacy_index") else None,
         taps=_taps(bank.shape[-1], most_angles, tasks.device) if most_angles > 1 else None,
     )
 
 
 def _taps(size: int, angles: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Return what rotates an image of a size by each angle."""
-    index, weight = zip(*(compute_taps(size, angle) for angle in range(angles)), strict=True)
-    return torch.stack(index).to(device), torch.stack(weight).to(device)
+    taps = [compute_taps(size, angle) for angle in range(angles)]
+    index, weight = map(torch.stack, zip(*taps, strict=True))
+    return index.to(device), weight.to(device)
 
 
 def _is_by_node(task: Task, kind: StateType) -> bool:
@@ -175,23 +185,27 @@ def _first_view(task: Task, kind: StateType) -> int:
 
 def _num_ids(task: Task, kind: StateType) -> int:
     """Return how many ids a state of a kind draws from."""
+    return 1 if task.observations.is_unique(kind) else _length(task, kind)
+
+
+def _length(task: Task, kind: StateType) -> int:
+    """Return how many ids the range of a kind of state has."""
     first, last = task.observations.ids(kind)
-    return 1 if task.observations.is_unique(kind) else last - first + 1
+    return last - first + 1
 
 
 def _legacy_index(tasks: _Different) -> LegacyIndex:
-    """A level of the tree begins with node (b^k - 1) / (b - 1), which has the legacy number b^k - 1."""
+    """Return how legacy numbers differ from nodes: level k begins with (b^k - 1) / (b - 1), whose number is b^k - 1."""
 
     def first(task: Task, level: int) -> int:
-        b = task.graph.branching_factor
-        return (b**level - 1) // (b - 1) if level <= task.graph.depth else MAX_STATES
+        return task.graph.first_node(level) if level <= task.graph.depth else MAX_STATES
 
     def shift(task: Task, level: int) -> int:
         return task.graph.branching_factor**level - 1 - first(task, level) if level <= task.graph.depth else 0
 
     def num_ids(task: Task, kind: StateType) -> int:
-        first, last = task.observations.ids(kind)
-        return last - first + 1 if task.observations.legacy_index and task.observations.is_unique(kind) else 1
+        legacy = task.observations.legacy_index and task.observations.is_unique(kind)
+        return _length(task, kind) if legacy else 1
 
     levels = range(tasks.max_depth + 1)
     return LegacyIndex(
@@ -203,18 +217,18 @@ def _legacy_index(tasks: _Different) -> LegacyIndex:
 
 def _reward_params(tasks: _Different, reward_fns: tuple[RewardFn, ...]) -> RewardParams:
     each = tasks.each
-    change = each(lambda task: task.goal_change or (0, 0))
+    change_first, change_last = each(lambda task: task.goal_change or (0, 0)).unbind(1)
     return RewardParams(
-        depth=each(lambda task: task.graph.depth),
-        num_leaves=each(lambda task: task.graph.num_end_states),
+        depth=each("graph.depth"),
+        num_leaves=each("graph.num_end_states"),
         reward_fn=each(lambda task: reward_fns.index(task.reward_fn)),
-        goal_reward=each(lambda task: task.goal_reward, torch.float32),
-        fail_reward=each(lambda task: task.fail_reward, torch.float32),
-        step_reward=each(lambda task: task.step_reward, torch.float32),
-        reward_std=each(lambda task: task.reward_std, torch.float32),
+        goal_reward=each("goal_reward", torch.float32),
+        fail_reward=each("fail_reward", torch.float32),
+        step_reward=each("step_reward", torch.float32),
+        reward_std=each("reward_std", torch.float32),
         multiplicative=each(lambda task: task.reward_noise == "multiplicative", torch.bool),
-        change_first=change[:, 0],
-        change_last=change[:, 1],
+        change_first=change_first,
+        change_last=change_last,
         legacy_change=each(lambda task: task.legacy_goal_change and bool(task.goal_change), torch.bool),
     )
 
