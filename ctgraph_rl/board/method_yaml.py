@@ -170,17 +170,20 @@ def _matches(pattern: re.Pattern[str], value: object) -> bool:
 
 
 def _text_rule(name: str, value: object, or_null: bool = False) -> Rule:
-    choice = "a text or null" if or_null else "a text"
-    return _is_text(value) or (or_null and value is None), f"{name} must be {choice}, got {value!r:.80}"
+    return _rule(name, value, _is_text(value), "a text", or_null)
 
 
 def _count_rule(name: str, value: object, or_null: bool = False) -> Rule:
-    choice = "an integer >= 0 or null" if or_null else "an integer >= 0"
-    return is_int(value, 0) or (or_null and value is None), f"{name} must be {choice}, got {value!r:.80}"
+    return _rule(name, value, is_int(value, 0), "an integer >= 0", or_null)
 
 
 def _hours_rule(name: str, value: object) -> Rule:
-    return value is None or is_real(value, 0), f"compute.{name} must be a number >= 0 or null, got {value!r:.80}"
+    return _rule(f"compute.{name}", value, is_real(value, 0), "a number >= 0", or_null=True)
+
+
+def _rule(name: str, value: object, holds: bool, what: str, or_null: bool) -> Rule:
+    choice = f"{what} or null" if or_null else what
+    return holds or (or_null and value is None), f"{name} must be {choice}, got {value!r:.80}"
 
 
 def completed(method: ReadOnlyValues, facts: Mapping[str, ReadOnlyValues]) -> NamedValues:

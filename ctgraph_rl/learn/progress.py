@@ -7,9 +7,10 @@ import time
 from collections.abc import Callable
 from datetime import timedelta
 from importlib.util import find_spec
+from typing import TYPE_CHECKING
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn
+if TYPE_CHECKING:
+    from rich.console import Console
 
 SECONDS_BETWEEN_LINES = 10.0
 
@@ -24,7 +25,27 @@ def silent(what: str, done: int, total: int) -> None:
     """Show nothing; a `Count`."""
 
 
-class StepCounter:
+class TextBar:
+    """A bar with a text beside it, for a terminal, and lines of text for other places.
+
+    Args:
+        console: where they show; default: standard error.
+        transient: the bar disappears at its end.
+    """
+
+    def __init__(self, console: Console | None, transient: bool = False) -> None:
+        from rich.console import Console  # here: --help shows no bar
+        from rich.progress import BarColumn, Progress, TextColumn  # here: as above
+
+        self.console = Console(stderr=True) if console is None else console
+        columns = (BarColumn(bar_width=16), TextColumn("{task.description}"))
+        self._bar = Progress(*columns, console=self.console, transient=transient)
+
+    def _print(self, text: str) -> None:
+        self.console.print(text, highlight=False, soft_wrap=True)
+
+
+class StepCounter(TextBar):
     """Shows steps done, rate and time left on standard error once `QUICK` seconds have passed; a context manager.
 
     Args:
@@ -32,10 +53,7 @@ class StepCounter:
     """
 
     def __init__(self, console: Console | None = None) -> None:
-        self.console = Console(stderr=True) if console is None else console
-        self._bar = Progress(
-            BarColumn(bar_width=16), TextColumn("{task.description}"), console=self.console, transient=True
-        )
+        super().__init__(console, transient=True)
         self._task = self._bar.add_task("")
         self._what = ""
         self._first = self._start = self._now = self._last_line = time.perf_counter()
@@ -62,10 +80,10 @@ class StepCounter:
             self._bar.update(self._task, completed=done, total=total, description=text)
         elif self._last_line == self._first or self._now - self._last_line >= SECONDS_BETWEEN_LINES:
             self._last_line = self._now
-            self.console.print(text, highlight=False, soft_wrap=True)
+            self._print(text)
 
 
-class ProgressBar:
+class ProgressBar(TextBar):
     """Shows block, frames, rate, return and time left on standard error; use it as a context manager.
 
     Args:
@@ -76,11 +94,10 @@ class ProgressBar:
     """
 
     def __init__(self, num_blocks: int, num_frames: int, console: Console | None = None, done: int = 0) -> None:
+        super().__init__(console)
         self.num_blocks = num_blocks
         self.num_frames = num_frames
         self.done = done
-        self.console = Console(stderr=True) if console is None else console
-        self._bar = Progress(BarColumn(bar_width=16), TextColumn("{task.description}"), console=self.console)
         self._live = self.console.is_terminal or (self.console.is_jupyter and find_spec("ipywidgets") is not None)
         self._task = self._bar.add_task(self.beginning, completed=done, total=num_frames)
         self._start = self._last_line = time.perf_counter()
@@ -89,7 +106,7 @@ class ProgressBar:
         if self._live:
             self._bar.start()
         elif self.done:
-            self.console.print(self.beginning, highlight=False, soft_wrap=True)
+            self._print(self.beginning)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -109,7 +126,7 @@ class ProgressBar:
             self._bar.update(self._task, completed=frames, description=text)
         elif now - self._last_line >= SECONDS_BETWEEN_LINES or frames == self.num_frames:
             self._last_line = now
-            self.console.print(text, highlight=False, soft_wrap=True)
+            self._print(text)
 
     def describe(self, block: int, frames: int, episode_return: float, seconds: float) -> str:
         """One line: block, frames, rate, return and time left."""

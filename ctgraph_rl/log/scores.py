@@ -258,17 +258,17 @@ def _first_blocks(log: RunLog, curriculum: Curriculum) -> NamedValues:
         reason = "needs announced boundaries: an episode of one task may end in the block of the next"
     if reason is not None:
         return dict.fromkeys(("first_frames", "first_episodes", "first_success_rates"), Undefined(reason))
+
+    def of_first(name: str) -> list[Tensor]:
+        by_block = log.training_by_block(name)
+        return [by_block.get(number + 1, float64([])) for number in first]
+
     starts = (0, *curriculum.ends)
-    nothing = float64([])
-    frames = log.training_by_block("frames")
-    episodes = log.training_by_block("episodes")
-    success_rates = log.training_by_block("success_rate")
-    found: dict[str, list[Tensor]] = {"first_frames": [], "first_episodes": [], "first_success_rates": []}
-    for number in first:
-        found["first_frames"].append(frames.get(number + 1, nothing) - starts[number])
-        found["first_episodes"].append(episodes.get(number + 1, nothing))
-        found["first_success_rates"].append(success_rates.get(number + 1, nothing))
-    return found
+    return {
+        "first_frames": [frames - starts[number] for frames, number in zip(of_first("frames"), first, strict=True)],
+        "first_episodes": of_first("episodes"),
+        "first_success_rates": of_first("success_rate"),
+    }
 
 
 def _regimes(

@@ -222,7 +222,7 @@ def solved_rate(solved: Sequence[bool | None], level: float = LEVEL) -> Estimate
     missing = len(solved) - len(known)
     method = f"share, Clopper-Pearson {level:.0%}"
     if not known:
-        return Estimate(None, None, None, 0, missing, method=method, reason="no seed has a result")
+        return _nothing(missing, method, "no seed has a result")
     low, high = gaffke(known, Bounds(0.0, 1.0), level)
     return Estimate(sum(known) / len(known), low=low, high=high, n=len(known), n_undefined=missing, method=method)
 
@@ -377,8 +377,8 @@ def seeds_needed(difference: float, std: float, paired: bool = False, level: flo
     return bisect_left(range(high), True, lo=high // 2 + 1, key=finds)
 
 
-def _nothing(missing: int, method: str) -> Estimate:
-    return Estimate(None, None, None, 0, missing, method=method, reason="no seed has a value")
+def _nothing(missing: int, method: str, reason: str = "no seed has a value") -> Estimate:
+    return Estimate(None, None, None, 0, missing, method=method, reason=reason)
 
 
 def _of_tasks(values: Sequence[Values], who: str, level: float, resamples: int) -> tuple[list[list[float]], int, int]:

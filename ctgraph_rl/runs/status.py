@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from ctgraph_rl.disk import read_regular, read_text, write_whole
+from ctgraph_rl.learn.progress import TextBar
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CHECKPOINTS, FAILURE, LOCK, LOG, METRICS, MOST_BYTES_OF_A_REASON
 from ctgraph_rl.log.sums import MOST_BYTES_OF_SUMS, SUMS, is_complete
@@ -165,7 +166,7 @@ def report(statuses: Mapping[str, Status], repeated: int = 0, most: int | None =
     return "\n".join(lines)
 
 
-class SweepProgress:
+class SweepProgress(TextBar):
     """Shows how many cells are done, failed and running on standard error; use it as a context manager.
 
     It looks at their directories every second, or less often where that takes long.
@@ -176,15 +177,11 @@ class SweepProgress:
     """
 
     def __init__(self, cells: Mapping[Path, RunOutcome], console: Console | None = None) -> None:
-        from rich.console import Console  # here: --help shows no bar
-        from rich.progress import BarColumn, Progress, TextColumn  # here: as above
-
+        super().__init__(console)
         self.total = len(cells)
-        self.console = Console(stderr=True) if console is None else console
         self._left = dict(cells)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
-        self._bar = Progress(BarColumn(bar_width=16), TextColumn("{task.description}"), console=self.console)
         self._task = self._bar.add_task("starting", total=self.total)
 
     def __enter__(self) -> SweepProgress:
@@ -214,7 +211,7 @@ class SweepProgress:
                 self._bar.update(self._task, completed=done, description=text)
             elif not over and now - last_line >= SECONDS_BETWEEN_LINES:
                 last_line = now
-                self.console.print(text, highlight=False, soft_wrap=True)
+                self._print(text)
 
     def look(self) -> tuple[int, int, int]:
         """Return the numbers of cells that are done, failed and running."""
