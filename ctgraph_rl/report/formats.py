@@ -91,7 +91,7 @@ def matrices(rows: Sequence[Row]) -> Iterator[Matrix]:
             for row in own:
                 if row.measure in cells:
                     cells[row.measure] = _as_cell(row, notes)
-            lines.append((agent, [TableCell(str(most.estimate).rpartition(" n = ")[2]), *cells.values()]))
+            lines.append((agent, [TableCell(most.estimate.seeds), *cells.values()]))
         yield Matrix(curriculum, ("n", *map(measure_name, measures)), lines, notes)
 
 
@@ -102,7 +102,7 @@ def _notes(rows: Sequence[Row]) -> list[str]:
 
 def _as_cell(row: Row, notes: Sequence[str]) -> TableCell:
     """Return a row as a cell of the table of agents and measures."""
-    value, _, interval = str(row.estimate).partition(" n = ")[0].partition(" ")
+    value, _, interval = row.estimate.shown.partition(" ")
     return TableCell(value, interval, notes.index(row.note) + 1 if row.note else 0)
 
 
@@ -160,9 +160,9 @@ def pages(rows: Sequence[Row]) -> Iterator[Page]:
         notes = _notes(its)
         lines = []
         for row in its:
-            value, _, n = str(row.estimate).partition(" n = ")
+            estimate = row.estimate
             mark = str(notes.index(row.note) + 1) if row.note else ""
-            lines.append(Line(row.shown, measure_name(row.measure), value, n, mark))
+            lines.append(Line(row.shown, measure_name(row.measure), estimate.shown, estimate.seeds, mark))
         yield Page(curriculum, lines, notes)
 
 

@@ -251,8 +251,8 @@ def _numbers(section: Section, result: Result) -> Iterator[Numbers]:
         for block, estimates in enumerate(matrix, first):
             row = [str(block)]
             for estimate in estimates:
-                value, _, _ = str(estimate).partition(" n = ")
-                row.append(value if estimate.n in (0, len(result.finished)) else f"{value} n = {estimate.n}")
+                complete = estimate.n in (0, len(result.finished))
+                row.append(estimate.shown if complete else f"{estimate.shown} n = {estimate.n}")
             rows.append(tuple(row))
         yield Numbers(title, ("block", *section.labels), rows)
 

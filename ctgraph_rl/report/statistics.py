@@ -78,12 +78,20 @@ class Estimate:
 
     def __str__(self) -> str:
         """Value, interval and seeds, such as ``0.50 [0.25, 0.75] n = 9/10``, or ``0.50 ± 0.10 n = 10``."""
+        return f"{self.shown} n = {self.seeds}"
+
+    @property
+    def shown(self) -> str:
+        """The value, with its interval or its standard deviation."""
         value = "-" if self.value is None else f"{self.value:z.2f}"
-        interval = "" if self.low is None or self.high is None else f" [{self.low:z.2f}, {self.high:z.2f}]"
         if self.std is not None:
-            interval = f" ± {self.std:.2f}"
-        missing = f"/{self.n + self.n_undefined}" if self.n_undefined else ""
-        return f"{value}{interval} n = {self.n}{missing}"
+            return f"{value} ± {self.std:.2f}"
+        return value if self.low is None or self.high is None else f"{value} [{self.low:z.2f}, {self.high:z.2f}]"
+
+    @property
+    def seeds(self) -> str:
+        """The number of seeds with a value, and of all where some have none."""
+        return f"{self.n}/{self.n + self.n_undefined}" if self.n_undefined else f"{self.n}"
 
 
 @dataclass(frozen=True)

@@ -55,16 +55,15 @@ def columns(line: Standing) -> list[BoardColumn]:
     per_task = entry.method["bytes_per_task"]
     numbers = []
     for name, estimate in line.estimates.items():
-        value, _, interval = str(estimate).partition(" n = ")[0].partition(" ")
+        value, _, interval = estimate.shown.partition(" ")
         numbers.append(BoardColumn(measure_name(name), value, estimate.value, interval))
-    n = str(line.score).rpartition(" n = ")[2]
     size = "-" if entry.agent_bytes is None else f"{entry.agent_bytes:,}"
     time = "-" if hours is None else f"{hours:.2g}" if hours < 10 else f"{hours:,.0f}"
     return [
         BoardColumn("rank", line.rank, line.best_rank),
         BoardColumn("method", line.name, line.name.lower()),
         *numbers,
-        BoardColumn("n", n, line.score.n),
+        BoardColumn("n", line.score.seeds, line.score.n),
         BoardColumn("bytes per task", f"{per_task:,}", per_task),
         BoardColumn("bytes of the agent", size, entry.agent_bytes),
         BoardColumn("steps", f"{entry.frames:,}", entry.frames),
@@ -105,7 +104,7 @@ def verdicts(table: BoardTable) -> list[tuple[str, str, str]]:
     for (one, other), found in table.pairs.items():
         unclear = "" if is_significant(found) else ", not distinguishable"
         p_value = "-" if found.holm is None else f"{found.holm:.2g}{unclear}"
-        shown.append((f"{one} - {other}", str(found.difference).partition(" n = ")[0], p_value))
+        shown.append((f"{one} - {other}", found.difference.shown, p_value))
     return shown
 
 
