@@ -167,11 +167,16 @@ def _plain(value: Any, whole: bool) -> Any:
 
 
 def make_fields_plain(instance: Any) -> None:
-    """Replace the numbers and arrays in the fields of a frozen dataclass by plain ones, see `plain`."""
+    """Replace the numbers and arrays in the fields of a frozen dataclass by plain ones, see `plain`.
+
+    What is given for a tuple, such as a list of a yaml file, becomes one.
+    """
     for each in fields(instance):
         if each.init:
-            value = getattr(instance, each.name)
-            object.__setattr__(instance, each.name, plain(value, whole=_is_whole(each.type)))
+            value = plain(getattr(instance, each.name), whole=_is_whole(each.type))
+            if str(each.type).startswith("tuple") and not isinstance(value, tuple):
+                value = as_tuple(value)
+            object.__setattr__(instance, each.name, value)
 
 
 def takes_numbers(function: Function) -> Function:

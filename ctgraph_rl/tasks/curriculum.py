@@ -20,7 +20,6 @@ from ctgraph_rl.checks import (
     ReadOnlyValues,
     Rule,
     as_path,
-    as_tuple,
     is_int,
     make_fields_plain,
     require,
@@ -71,7 +70,6 @@ class Curriculum:
 
     def __post_init__(self) -> None:
         make_fields_plain(self)
-        object.__setattr__(self, "blocks", as_tuple(self.blocks))
         blocks = self.blocks
         only_blocks = isinstance(blocks, tuple) and bool(blocks) and all(isinstance(each, Block) for each in blocks)
         require(

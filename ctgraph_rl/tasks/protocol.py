@@ -10,7 +10,6 @@ from ctgraph_rl.checks import (
     ReadOnlyValues,
     Rule,
     are_ints,
-    as_tuple,
     at_least_one,
     did_you_mean,
     is_int,
@@ -62,7 +61,7 @@ class Block:
 
     def __post_init__(self) -> None:
         make_fields_plain(self)
-        tasks = (self.tasks,) if is_dataclass(self.tasks) else as_tuple(self.tasks)
+        tasks = (self.tasks,) if is_dataclass(self.tasks) else self.tasks
         object.__setattr__(self, "tasks", tasks)
         only_tasks = "a block needs at least one Task and nothing else"
         switches = self.switch is None or (is_dataclass(self.switch) and switch_rule(self.switch)[0])
@@ -129,7 +128,7 @@ class Evaluation:
         make_fields_plain(self)
         n = self.num_episodes
         per_row = self.episodes_per_row
-        held_out = (self.held_out,) if is_dataclass(self.held_out) else as_tuple(self.held_out)
+        held_out = (self.held_out,) if is_dataclass(self.held_out) else self.held_out
         object.__setattr__(self, "held_out", held_out)
         require(
             *at_least_one(num_episodes=n, episodes_per_row=per_row),
@@ -209,8 +208,7 @@ class Protocol:
     def __post_init__(self) -> None:
         make_fields_plain(self)
         require(*one_of(TASK_IDS, task_id=self.task_id), *one_of(BOUNDARIES, boundaries=self.boundaries))
-        ids = as_tuple(self.task_ids)
-        object.__setattr__(self, "task_ids", ids)
+        ids = self.task_ids
         is_ids = ids is None or (are_ints(ids, 0, MOST_IDS) and bool(ids))
         names_ids = self.task_id != "hidden" or (ids is None and self.num_task_ids is None)
         differ = not isinstance(ids, tuple) or not is_ids or len(set(ids)) == len(ids)

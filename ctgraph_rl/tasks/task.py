@@ -111,16 +111,13 @@ class Task:
     def __post_init__(self) -> None:
         make_fields_plain(self)
         self._check_parts()
-        if not isinstance(self.goal, Decisions):
-            object.__setattr__(self, "goal", as_tuple(self.goal))
-        object.__setattr__(self, "goal_change", as_tuple(self.goal_change))
-        swap = as_tuple(self.swapped_branches)
-        object.__setattr__(self, "swapped_branches", tuple(map(as_tuple, swap)) if isinstance(swap, tuple) else swap)
+        if isinstance(self.swapped_branches, tuple):
+            object.__setattr__(self, "swapped_branches", tuple(map(as_tuple, self.swapped_branches)))
         one_hot = len(self.images.shape) == 1
         x = self.observations
         varies = x.read_noise or x.read_rotation or (x.reward_cue and not has_cue_element(self.images))
         room = self.images.num_images
-        last_id = self.observations.last_id
+        last_id = x.last_id
         too_few = f"num_images={room} is too few for id {last_id} in observations: needs at least {last_id + 1}"
         require(
             self._goal_rule(),

@@ -12,7 +12,6 @@ from torch import Tensor
 from ctgraph_rl.checks import (
     Rule,
     are_ints,
-    as_tuple,
     at_least_one,
     is_int,
     is_real,
@@ -110,7 +109,6 @@ class GroupedImages(SquareImages):
 
     def __post_init__(self) -> None:
         make_fields_plain(self)
-        object.__setattr__(self, "groups", as_tuple(self.groups))
         groups = self.groups
         groups_ok = bool(groups) and are_ints(groups, 1)
         cells = self.cells if is_int(self.cells, 1) else 1

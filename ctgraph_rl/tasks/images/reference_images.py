@@ -11,9 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import Rule, is_int, is_real, make_fields_plain, require, require_memory
+from ctgraph_rl.checks import is_int, is_real, make_fields_plain, require, require_memory
 from ctgraph_rl.tasks.images.generated import BLUEPRINT_SIZE
 from ctgraph_rl.tasks.images.image_set import WHITE, SquareImages
+from ctgraph_rl.tasks.images.one_hot import OneHot
 
 MAX_SEED = 2**32 - 1
 """Seeds of the authors' implementation are those of ``numpy.random.RandomState``."""
@@ -53,7 +54,7 @@ class ReferenceImages(SquareImages):
     def __post_init__(self) -> None:
         make_fields_plain(self)
         require(
-            _num_images_rule(self.num_images),
+            (is_int(self.num_images, 1), f"num_images must be an integer >= 1, got {self.num_images!r}"),
             (is_int(self.seed, 0, MAX_SEED), f"image seed must be in [0, 2**32), got {self.seed!r}"),
             (is_real(self.noise, 0, WHITE), f"noise must be a number in [0, {WHITE}], got {self.noise!r}"),
         )
@@ -81,7 +82,7 @@ class ReferenceImages(SquareImages):
 
 
 @dataclass(frozen=True)
-class ReferenceOneHot:
+class ReferenceOneHot(OneHot):
     """The 1D observations of the authors' implementation: 254 at the id's place, and a last element for the reward cue.
 
     The vector has K + 1 elements here, where the authors' implementation has an array of shape (K + 1, 1).
@@ -90,15 +91,8 @@ class ReferenceOneHot:
         num_images: K, the number of ids.
     """
 
-    num_images: int
-
-    num_variants = 1
     white = WHITE
     cue_element = True
-
-    def __post_init__(self) -> None:
-        make_fields_plain(self)
-        require(_num_images_rule(self.num_images))
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -108,10 +102,6 @@ class ReferenceOneHot:
     def bank(self, read_rotation: int) -> Tensor:
         """uint8 [K, K + 1]: 254 times the identity, and a column of zeros; a vector has no rotation."""
         return WHITE * torch.eye(self.num_images, self.num_images + 1, dtype=torch.uint8, device="cpu")
-
-
-def _num_images_rule(value: object) -> Rule:
-    return is_int(value, 1), f"num_images must be an integer >= 1, got {value!r}"
 
 
 @lru_cache(maxsize=16)

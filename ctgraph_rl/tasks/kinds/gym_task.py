@@ -63,7 +63,6 @@ class GymTask:
         wrappers = as_tuple(self.wrappers)
         wrappers = tuple(map(_import_name, wrappers)) if isinstance(wrappers, tuple) else wrappers
         object.__setattr__(self, "wrappers", wrappers)
-        object.__setattr__(self, "return_range", as_tuple(self.return_range))
         names = isinstance(wrappers, tuple) and all(isinstance(each, str) and ":" in each for each in wrappers)
         limit = self.max_episode_steps
         pair = self.return_range
