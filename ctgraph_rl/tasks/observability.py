@@ -22,7 +22,7 @@ POLICIES = ("random", "navigation", "optimal")
 PLACED = (StateType.WAIT, StateType.DECISION, StateType.END)
 """Kinds of which a graph may have several states."""
 
-Visits = dict[StateType, dict[int, float]]
+VisitsByLevel = dict[StateType, dict[int, float]]
 """Expected visits of an episode to the states of each kind, by level."""
 
 
@@ -130,7 +130,7 @@ def _drawn_bits(task: Task, kind: StateType) -> float:
     return math.log2(1 + last - first)
 
 
-def _pair_bits(visits: Visits, bits: Mapping[StateType, float], task: Task, branches: int) -> float:
+def _pair_bits(visits: VisitsByLevel, bits: Mapping[StateType, float], task: Task, branches: int) -> float:
     """-sum over pairs of c log2(c / n), where a pair of observation and reward comes c times in an episode's n steps.
 
     Equal pairs are one group, (their expected number together, log2 of how many there are).
@@ -163,11 +163,11 @@ def _branches(graph: CTGraph, policy: str) -> int:
     return 1 if policy == "optimal" else graph.branching_factor
 
 
-def _visits(graph: CTGraph, waits: float, decides: float) -> Visits:
+def _visits(graph: CTGraph, waits: float, decides: float) -> VisitsByLevel:
     """Expected visits of each kind of state by level; home has one visit, and the fail state the rest of the ends."""
     p = graph.wait_prob
     leaves = waits * (1 - p) / (1 - waits * p)
-    visits: Visits = {kind: {} for kind in PLACED}
+    visits: VisitsByLevel = {kind: {} for kind in PLACED}
     for level in range(graph.depth + 1):
         reached = (leaves * decides) ** level
         visits[StateType.WAIT][level] = reached / (1 - waits * p)
@@ -176,7 +176,7 @@ def _visits(graph: CTGraph, waits: float, decides: float) -> Visits:
     return visits
 
 
-def _count(visits: Visits) -> dict[StateType, float]:
+def _count(visits: VisitsByLevel) -> dict[StateType, float]:
     """Expected visits of each kind of state."""
     return {kind: sum(by_level.values()) for kind, by_level in visits.items()}
 
