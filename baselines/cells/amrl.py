@@ -57,43 +57,47 @@ class AMRL(Cell):
 
     def zeros(self, num_rows: int) -> CellState:
         """Return zeros: of the LSTM, and the maxima, [num_rows, num_outputs // 2], or sums and a count."""
-        widths = [self.num_outputs // 2, 1][: 1 if self.is_max else 2]
-        return (*self.inner.zeros(num_rows), *(zeros_like_weights(self, num_rows, width) for width in widths))
+        aggregated = zeros_like_weights(self, num_rows, self.num_outputs // 2)
+        zeros = (*self.inner.zeros(num_rows), aggregated)
+        return zeros if self.is_max else (*zeros, zeros_like_weights(self, num_rows, 1))
 
     def step(self, inputs: Tensor, state: CellState) -> CellOutput:
         """See `Cell`."""
         memory, inner = self.inner.step(inputs, state[:2])
         x, y = memory.chunk(2, dim=-1)
-        aggregate, after = self._aggregate(x.unsqueeze(1), x.new_zeros(len(x), 1, dtype=torch.bool), state[2:])
-        return self._output(aggregate[:, 0], y), (*inner, *after)
+        starts = x.new_zeros(len(x), 1, dtype=torch.bool)
+        m, after = self._aggregate(x.unsqueeze(1), starts, state[2:])
+        return self._output(m[:, 0], y), (*inner, *after)
 
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
         """See `Cell`; the aggregates are scans."""
-        x, y = self.inner.sequence(inputs, groups, starts, state[:2]).chunk(2, dim=-1)
-        return self._output(self._aggregate(x, starts, state[2:])[0], y)
+        memory = self.inner.sequence(inputs, groups, starts, state[:2])
+        x, y = memory.chunk(2, dim=-1)
+        m, _ = self._aggregate(x, starts, state[2:])
+        return self._output(m, y)
 
     def _aggregate(self, x: Tensor, starts: Tensor, state: CellState) -> CellOutput:
-        """Return the aggregates of [rows, steps, n] at each step, and the state after the last one."""
+        """Return m of x, [rows, steps, n] each, and the state after the last step."""
         if self.is_max:
             first = torch.maximum(state[0].unsqueeze(1), x[:, :1])
-            largest = max_scan(torch.cat([first, x[:, 1:].relu()], dim=1), starts)
-            straight = _sums(x, starts, state[0]) if self.straight_through else largest
-            return _borrow_gradient(straight, largest), (largest[:, -1],)
-        sums = _sums(x, starts, state[0])
-        counts = _sums(torch.ones_like(x[..., :1]), starts, state[1])
-        mean = sums / counts
-        return _borrow_gradient(sums if self.straight_through else mean, mean), (sums[:, -1], counts[:, -1])
+            m = max_scan(torch.cat([first, x[:, 1:].relu()], dim=1), starts)
+            after: CellState = (m[:, -1],)
+        else:
+            sums = _sums(x, starts, state[0])
+            counts = _sums(torch.ones_like(x[..., :1]), starts, state[1])
+            m = sums / counts
+            after = (sums[:, -1], counts[:, -1])
+        if self.straight_through:
+            straight = _sums(x, starts, state[0]) if self.is_max else sums
+            m = m.detach() + (straight - straight.detach())
+        return m, after
 
-    def _output(self, aggregate: Tensor, y: Tensor) -> Tensor:
-        return self.linear(torch.cat([y, aggregate], dim=-1)).relu()
+    def _output(self, m: Tensor, y: Tensor) -> Tensor:
+        return self.linear(torch.cat([y, m], dim=-1)).relu()
 
 
 def _sums(inputs: Tensor, starts: Tensor, state: Tensor) -> Tensor:
     """Return the sums of [rows, steps, n] inputs since the start of the episode, and of a state before them."""
-    inputs = torch.cat([state.unsqueeze(1) + inputs[:, :1], inputs[:, 1:]], dim=1)
-    return linear_scan((~starts).unsqueeze(-1).to(inputs.dtype), inputs)
-
-
-def _borrow_gradient(other: Tensor, values: Tensor) -> Tensor:
-    """Return values with the gradient of others."""
-    return values if other is values else values.detach() + (other - other.detach())
+    first = state.unsqueeze(1) + inputs[:, :1]
+    carry = (~starts).unsqueeze(-1).to(inputs.dtype)
+    return linear_scan(carry, torch.cat([first, inputs[:, 1:]], dim=1))

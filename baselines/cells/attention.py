@@ -91,7 +91,8 @@ class Attention(Cell):
         episode = number_episodes(starts)
         earlier = torch.where(state[0][..., -1] > 0, 0, -1)
         of_frame = torch.cat([earlier, episode], dim=1)
-        return self._block(frames, groups.shape[1], of_frame.unsqueeze(1) == episode.unsqueeze(2))
+        same = of_frame.unsqueeze(1) == episode.unsqueeze(2)
+        return self._block(frames, groups.shape[1], same)
 
     def _block(self, frames: Tensor, num_steps: int, same: Tensor) -> Tensor:
         """Compute the outputs of the last steps, [rows, num_steps, num_outputs].
@@ -101,20 +102,22 @@ class Attention(Cell):
             num_steps: how many steps have an output.
             same: whether a frame is of a step's episode, bool [rows, num_steps, frames].
         """
-        entered = self.enter(frames)
-        parts = self.attended(self.first_norm(entered)).chunk(3, dim=-1)
-        queries = self._by_head(parts[0][:, -num_steps:])
-        keys = self._by_head(parts[1])
-        values = self._by_head(parts[2])
+        x = self.enter(frames)
+        q, k, v = self.attended(self.first_norm(x)).chunk(3, dim=-1)
+        q = self._by_head(q[:, -num_steps:])
+        k = self._by_head(k)
+        v = self._by_head(v)
         places = torch.arange(frames.shape[1], device=frames.device)
         distance = places[-num_steps:].unsqueeze(1) - places
         near = (distance >= 0) & (distance < self.num_frames)
         bias = self.bias[:, distance.clamp(0, self.num_frames - 1)]
-        scores = queries @ keys.transpose(-1, -2) / math.sqrt(queries.shape[-1]) + bias
-        shares = scores.masked_fill(~(same & near).unsqueeze(1), -torch.inf).softmax(dim=-1)
-        attended = (shares @ values).transpose(1, 2).flatten(2)
-        left = entered[:, -num_steps:] + self.leave(attended)
-        return left + self.narrower(self.wider(self.second_norm(left)).relu())
+        scores = q @ k.transpose(-1, -2) / math.sqrt(q.shape[-1]) + bias
+        hidden = ~(same & near).unsqueeze(1)
+        shares = scores.masked_fill(hidden, -torch.inf).softmax(dim=-1)
+        a = (shares @ v).transpose(1, 2).flatten(2)
+        y = x[:, -num_steps:] + self.leave(a)
+        wide = self.wider(self.second_norm(y)).relu()
+        return y + self.narrower(wide)
 
     def _by_head(self, values: Tensor) -> Tensor:
         """Return values as [rows, num_heads, steps, width]."""

@@ -24,7 +24,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from baselines.cells.cell import Cell, CellOutput, CellState, linear_layer, zeros_like_weights
+from baselines.cells.cell import Cell, CellOutput, CellState, linear_layer, of_frames, zeros_like_weights
 from baselines.cells.plastic_sequence import Plastic, PlasticSequence, PlasticSteps, columns_times
 from ctgraph_rl.checks import one_of, require
 
@@ -52,7 +52,9 @@ class Backpropamine(Cell):
         super().__init__(num_features, num_outputs, num_actions, **reads)
         require(*one_of(MODULATIONS, modulation=modulation))
         self.modulation = modulation
-        self.state_keys = ("unstored_hidden", "unstored_hebb", *["unstored_trace"] * (modulation == "retroactive"))
+        self.state_keys = ("unstored_hidden", "unstored_hebb")
+        if modulation == "retroactive":
+            self.state_keys += ("unstored_trace",)
         self.input = linear_layer(self.num_inputs, num_outputs)
         self.recurrent = nn.Parameter(torch.empty(num_outputs, num_outputs, dtype=torch.float32, device="cpu"))
         self.plasticity = nn.Parameter(torch.empty(num_outputs, num_outputs, dtype=torch.float32, device="cpu"))
@@ -65,16 +67,17 @@ class Backpropamine(Cell):
 
     def reset_parameters(self) -> None:
         """Draw W and A, and set the learned rate to 0.01; the linear layers draw their own."""
-        for weights in (self.recurrent, self.plasticity):
-            nn.init.uniform_(weights, 0, 0.001)
+        nn.init.uniform_(self.recurrent, 0, 0.001)
+        nn.init.uniform_(self.plasticity, 0, 0.001)
         if self.modulation != "simple":
             nn.init.constant_(self.rate, 0.01)
 
     def zeros(self, num_rows: int) -> CellState:
         """Return the units, [num_rows, H], and the fast weights, [num_rows, H, H] each."""
         size = self.num_outputs
-        matrices = (zeros_like_weights(self, num_rows, size, size) for _ in self.state_keys[1:])
-        return (zeros_like_weights(self, num_rows, size), *matrices)
+        units = zeros_like_weights(self, num_rows, size)
+        matrices = [zeros_like_weights(self, num_rows, size, size) for _ in self.state_keys[1:]]
+        return (units, *matrices)
 
     def step(self, inputs: Tensor, state: CellState) -> CellOutput:
         """See `Cell`."""
@@ -82,7 +85,7 @@ class Backpropamine(Cell):
 
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
         """See `Cell`; inputs are multiplied with their weights once a group."""
-        given = self.input(inputs).index_select(0, groups.T.flatten()).unflatten(0, groups.T.shape)
+        given = of_frames(self.input(inputs), groups.T)
         resets = [start.nonzero().squeeze(-1) for start in starts.unbind(1)]
         resets[0] = resets[0][:0]  # zero already
         steps = PlasticSteps(self._step, LARGEST_FAST_WEIGHT, resets)
@@ -91,17 +94,23 @@ class Backpropamine(Cell):
     def _plastic(self) -> Plastic:
         """Return the weights other than those of the inputs."""
         rate = None if self.modulation == "simple" else self.rate
-        layers = () if self.modulation == "none" else (self.modulator, self.fan_out)
-        others = (weights for layer in layers for weights in (layer.weight, layer.bias))
-        return Plastic(self.recurrent, self.plasticity, rate, *others)
+        if self.modulation == "none":
+            return Plastic(self.recurrent, self.plasticity, rate)
+        modulator = (self.modulator.weight, self.modulator.bias)
+        return Plastic(self.recurrent, self.plasticity, rate, *modulator, self.fan_out.weight, self.fan_out.bias)
 
     def _step(self, given: Tensor, state: CellState, product: Tensor | None = None) -> CellOutput:
         """Take a step from the inputs times their weights, [rows, H]; ``product`` is overwritten."""
-        before, hebb, *trace = state
-        fast = columns_times(before, torch.mul(self.plasticity, hebb, out=product))
-        units = (given + before @ self.recurrent + fast).tanh()
+        before, hebb, *traces = state
+        fast = torch.mul(self.plasticity, hebb, out=product)
+        units = (given + before @ self.recurrent + columns_times(before, fast)).tanh()
         eta = self.rate if self.modulation == "none" else self.fan_out(self.modulator(units).tanh())
         column = before.unsqueeze(2)
-        change = (trace[0], eta.unsqueeze(1)) if trace else (column, (eta * units).unsqueeze(1))
-        following = torch.addcmul(hebb, *change).clamp_(-LARGEST_FAST_WEIGHT, LARGEST_FAST_WEIGHT)
-        return units, (units, following, *(each.lerp(column * units.unsqueeze(1), self.rate) for each in trace))
+        if self.modulation == "retroactive":
+            [trace] = traces
+            hebb = torch.addcmul(hebb, trace, eta.unsqueeze(1))
+            traces = [trace.lerp(column * units.unsqueeze(1), self.rate)]
+        else:
+            hebb = torch.addcmul(hebb, column, (eta * units).unsqueeze(1))
+        hebb = hebb.clamp_(-LARGEST_FAST_WEIGHT, LARGEST_FAST_WEIGHT)
+        return units, (units, hebb, *traces)

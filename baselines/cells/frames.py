@@ -66,7 +66,9 @@ class Frames(Cell):
         """See `Cell`; a frame counts if no episode has started since."""
         frames = torch.cat([state[0], of_frames(inputs, groups)], dim=1)
         episode = number_episodes(starts)
-        of_frame = torch.cat([episode.new_zeros(len(starts), self.num_frames - 1), episode], dim=1)
+        earlier = episode.new_zeros(len(starts), self.num_frames - 1)
+        of_frame = torch.cat([earlier, episode], dim=1)
         windows = frames.unfold(1, self.num_frames, 1).transpose(2, 3)
         same = of_frame.unfold(1, self.num_frames, 1) == episode.unsqueeze(-1)
-        return self.linear((windows * same.unsqueeze(-1)).flatten(2)).relu()
+        seen = windows * same.unsqueeze(-1)
+        return self.linear(seen.flatten(2)).relu()

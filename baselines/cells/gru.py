@@ -5,6 +5,8 @@ Cho et al. 2014 (arXiv 1406.1078), with PyTorch's `torch.nn.GRU` of one layer.
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor, nn
 
@@ -26,47 +28,30 @@ class GRU(Cell):
     def step(self, inputs: Tensor, state: CellState) -> CellOutput:
         """See `Cell`."""
         if is_traced():  # PyTorch's own cannot be vectorised over seeds
-            num_rows = len(inputs)
-            each = torch.arange(num_rows, device=inputs.device)
-            output = packed_gru(
-                self.gru, inputs, each, torch.tensor([num_rows], dtype=torch.int64, device="cpu"), state[0]
-            )
+            after = gru_step(self.gru, gru_inputs(self.gru, inputs), state[0])
         else:
-            output = self.gru(inputs.unsqueeze(1), state[0].unsqueeze(0))[0].squeeze(1)
-        return output, (output,)
+            output, _ = self.gru(inputs.unsqueeze(1), state[0].unsqueeze(0))
+            after = (output.squeeze(1),)
+        return after[0], after
 
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
         """See `Cell`; each segment between two resets is a sequence, and the GRU runs over all of them at once."""
-        found = segments(starts)
-        frames = groups.flatten()[found.frames]
-        memory = packed_gru(self.gru, inputs, frames, found.sizes, found.initial(state[0]))
-        return found.unpacked(memory).unflatten(0, starts.shape)
+        step = partial(gru_step, self.gru)
+        return segments(starts).run(step, gru_inputs(self.gru, inputs), groups, state)
 
 
-def packed_gru(gru: nn.GRU, features: Tensor, groups: Tensor, sizes: Tensor, h: Tensor) -> Tensor:
-    """Run a GRU of one layer over packed sequences, with one product of features and weights for each group.
+def gru_inputs(gru: nn.GRU, features: Tensor) -> Tensor:
+    """Compute what features add to r, z and n of a GRU of one layer, [..., 3 * hidden_size]."""
+    of_features, _, bias, _ = gru.all_weights[0]
+    return nn.functional.linear(features, of_features, bias)
 
-    PyTorch's own backward pass writes a tensor of all frames at each step.
 
-    Args:
-        gru: the GRU.
-        features: of each group, [num_groups, num_features].
-        groups: of each frame in packed order, int64 [num_frames].
-        sizes: number of sequences at each step, int64 [num_steps] on the CPU.
-        h: the initial states of the sequences, [num_sequences, hidden_size].
-
-    Returns:
-        The states at all frames in packed order, [num_frames, hidden_size].
-    """
-    of_features, of_h, bias, of_h_bias = gru.all_weights[0]
-    given = nn.functional.linear(features, of_features, bias)
-    memory = []
-    for step in given.index_select(0, groups).split(sizes.tolist()):
-        h = h[: len(step)]
-        carried = torch.addmm(of_h_bias, h, of_h.t())
-        width = h.shape[1]
-        r, z = (step[:, : 2 * width] + carried[:, : 2 * width]).sigmoid().chunk(2, dim=1)
-        n = torch.addcmul(step[:, 2 * width :], r, carried[:, 2 * width :]).tanh()
-        h = torch.lerp(n, h, z)
-        memory.append(h)
-    return torch.cat(memory)
+def gru_step(gru: nn.GRU, given: Tensor, h: Tensor) -> CellState:
+    """Compute the next state, [rows, hidden_size], from `gru_inputs` and the present one."""
+    _, of_h, _, bias = gru.all_weights[0]
+    carried = torch.addmm(bias, h, of_h.t())
+    width = 2 * h.shape[1]
+    gates = (given[:, :width] + carried[:, :width]).sigmoid()
+    r, z = gates.chunk(2, dim=1)
+    n = torch.addcmul(given[:, width:], r, carried[:, width:]).tanh()
+    return (torch.lerp(n, h, z),)

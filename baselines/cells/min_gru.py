@@ -31,9 +31,12 @@ class MinGRU(Cell):
 
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
         """See `Cell`; a scan, in which a reset is a carry of 0."""
-        carry, given = (of_frames(part, groups) for part in self._parts(inputs))
+        carry, given = self._parts(inputs)
+        carry = of_frames(carry, groups)
+        given = of_frames(given, groups)
         first = given[:, :1] + carry[:, :1] * state[0].unsqueeze(1)
-        return linear_scan(carry * ~starts.unsqueeze(-1), torch.cat([first, given[:, 1:]], dim=1))
+        goes_on = ~starts.unsqueeze(-1)
+        return linear_scan(carry * goes_on, torch.cat([first, given[:, 1:]], dim=1))
 
     def _parts(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return what the state is multiplied by, and what is added to it."""

@@ -20,7 +20,8 @@ def linear_scan(carry: Tensor, inputs: Tensor) -> Tensor:
         inputs: [rows, steps, n].
     """
     for distance in _distances(inputs):
-        inputs = _with_earlier(inputs, inputs[:, distance:] + carry[:, distance:] * inputs[:, :-distance])
+        carried = carry[:, distance:] * inputs[:, :-distance]
+        inputs = _with_earlier(inputs, inputs[:, distance:] + carried)
         carry = _with_earlier(carry, carry[:, distance:] * carry[:, :-distance])
     return inputs
 

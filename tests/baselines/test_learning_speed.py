@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 import torch
 from helpers.scripted import BARE, RUN, seconds
@@ -15,7 +17,8 @@ from torchrl.envs.utils import set_exploration_type
 from torchrl.modules import LSTMModule, set_recurrent_mode
 from torchrl.objectives import A2CLoss, ClipPPOLoss, ReinforceLoss, ValueEstimators
 
-from baselines.cells.lstm import packed_lstm
+from baselines.cells.lstm import lstm_inputs, lstm_step
+from baselines.cells.packed import Segments
 from baselines.parts.distinct import distinct
 from baselines.parts.networks import GROUP
 from baselines.update import seeds as together
@@ -93,8 +96,9 @@ def test_a_packed_lstm_and_its_gradients_equal_pytorchs():
     lstm, sizes = nn.LSTM(3, 4).double(), torch.tensor([5, 3, 3, 1])
     features, kinds = torch.randn(6, 3, dtype=torch.float64, requires_grad=True), torch.randint(6, (12,))
     h, c = torch.randn(2, 1, 5, 4, dtype=torch.float64, requires_grad=True).unbind()
+    sequences = Segments(torch.arange(12), sizes, torch.arange(5), torch.ones(5, dtype=torch.bool))
 
-    memory = packed_lstm(lstm, features, kinds, sizes, (h, c))
+    [memory] = sequences.run(partial(lstm_step, lstm), lstm_inputs(lstm, features), kinds.unsqueeze(0), (h[0], c[0]))
 
     expected = lstm(PackedSequence(features[kinds], sizes), (h, c))[0].data
     wanted, by = [features, h, c, *lstm.parameters()], torch.randn_like(memory)
