@@ -44,7 +44,9 @@ from ctgraph_rl.learn.collect import UNSTORED
 
 SMALLEST_VARIANCE = 1e-7
 
-ACTION, PRECISION, WEIGHTED = f"{UNSTORED}action", f"{UNSTORED}precision", f"{UNSTORED}weighted"
+ACTION = f"{UNSTORED}action"
+PRECISION = f"{UNSTORED}precision"
+WEIGHTED = f"{UNSTORED}weighted"
 """A row's last action, and the sums of 1/s_i and mu_i/s_i over the steps of its trial."""
 
 CONTEXT = f"{UNSTORED}context"

@@ -43,13 +43,20 @@ class L2D2C(MaskExchange):
         """Send queries, and answer what was received."""
         if kind == "query":
             task = self.task_of(member)
-            return to_all(kind, member, self.num_members, {"task": task, "reward": self.return_of(member, task)})
+            return to_all(kind, member, self.num_members, self._about(member, task))
         if kind == "request":
             best = self._best(member, received)
             return [Message(kind, member, offer.sender, {"task": offer.content["task"]}) for offer in best]
-        is_answered = self._is_better if kind == "offer" else self._is_known
-        answered = [each for each in received if is_answered(member, each)]
-        return [Message(kind, member, each.sender, self._about(kind, member, each)) for each in answered]
+        answers = []
+        for asked in received:
+            task = asked.content["task"]
+            content = self._about(member, task)
+            if kind == "mask" and task in self.returns[member]:
+                scores = self.methods[member].scores_of(task)
+                answers.append(Message(kind, member, asked.sender, {**content, "scores": scores}))
+            if kind == "offer" and self._is_better(member, asked):
+                answers.append(Message(kind, member, asked.sender, content))
+        return answers
 
     def receive(self, member: int, received: Sequence[Message]) -> Sequence[Help]:
         """Replace the scores of the present task."""
@@ -67,22 +74,19 @@ class L2D2C(MaskExchange):
         own = self.return_of(member, query.content["task"])
         return own > 0 and _is_wanted(own, query.content["reward"])
 
-    def _is_known(self, member: int, request: Message) -> bool:
-        """Return whether a member has learned a task."""
-        return request.content["task"] in self.returns[member]
-
-    def _about(self, kind: str, member: int, asked: Message) -> dict[str, object]:
-        """Return the content of an offer or a mask."""
-        task = asked.content["task"]
-        about: dict[str, object] = {"task": task, "reward": self.return_of(member, task)}
-        return about if kind == "offer" else {**about, "scores": self.methods[member].scores_of(task)}
+    def _about(self, member: int, task: int) -> dict[str, object]:
+        """Return what a member says of a task."""
+        return {"task": task, "reward": self.return_of(member, task)}
 
     def _best(self, member: int, received: Sequence[Message]) -> list[Message]:
         """Return the message of the highest return, of those that still concern the task; none if there is none."""
         task = self.task_of(member)
         own = self.return_of(member, task)
-        wanted = [m for m in received if m.content["task"] == task and _is_wanted(m.content["reward"], own)]
-        return sorted(wanted, key=lambda m: (-m.content["reward"], m.sender))[:1]
+        wanted = []
+        for each in received:
+            if each.content["task"] == task and _is_wanted(each.content["reward"], own):
+                wanted.append(each)
+        return sorted(wanted, key=lambda each: (-each.content["reward"], each.sender))[:1]
 
 
 def _is_wanted(reward: float, own: float) -> bool:

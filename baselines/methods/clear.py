@@ -44,15 +44,16 @@ class Reservoir:
             self.items = {key: value.new_zeros(self.capacity, *value.shape[1:]) for key, value in items.items()}
         number = next(iter(items.values())).shape[0]
         order = torch.arange(self.offered, self.offered + number, device="cpu")
-        drawn = (torch.rand(number, dtype=torch.float64, device="cpu") * (order + 1)).long()
+        share = torch.rand(number, dtype=torch.float64, device="cpu")
+        drawn = (share * (order + 1)).long()
         place = torch.where(order < self.capacity, order, drawn)
-        taken = place < self.capacity
-        last = torch.full([self.capacity], -1, dtype=torch.int64, device="cpu").scatter_reduce(
-            0, place[taken], taken.nonzero().squeeze(-1), "amax"
-        )
+        taken = (place < self.capacity).nonzero().squeeze(-1)
+        none = torch.full([self.capacity], -1, dtype=torch.int64, device="cpu")
+        last = none.scatter_reduce(0, place[taken], taken, "amax")
         places = (last >= 0).nonzero().squeeze(-1)
         for key, value in items.items():
-            self.items[key][places.to(value.device)] = value.index_select(0, last[places].to(value.device))
+            chosen = value.index_select(0, last[places].to(value.device))
+            self.items[key][places.to(value.device)] = chosen
         self.offered += number
 
     def sample(self, number: int) -> Items:
@@ -111,15 +112,20 @@ class CLEAR(Method):
         keys = [key for key in agent.policy.in_keys if key in batch.keys()]  # noqa: SIM118, rows otherwise
         inputs = sequences_of(batch, keys)
         outputs = agent.outputs(inputs)
-        items = {**inputs, **{key: outputs[key] for key in agent.output_keys}}
-        self.reservoir.offer(items if agent.memory else {key: value.flatten(0, 1) for key, value in items.items()})
+        items = dict(inputs)
+        for key in agent.output_keys:
+            items[key] = outputs[key]
+        if not agent.memory:
+            items = {key: value.flatten(0, 1) for key, value in items.items()}
+        self.reservoir.offer(items)
 
     def transform_minibatch(self, batch: Data) -> Data:
         """Add as many replayed items to the minibatch, if there are any yet."""
         if not len(self.reservoir):
             return batch
         replayed = self.reservoir.sample(len(batch["action"]))
-        return {**batch, **{("replay", key): value for key, value in replayed.items()}}
+        replay = {("replay", key): value for key, value in replayed.items()}
+        return {**batch, **replay}
 
     def penalties(self, batch: Data, weights: Sequence[Tensor]) -> TensorsByName:
         """Compute the cloning losses."""

@@ -43,8 +43,11 @@ class MaskSC(SelectedMasks):
 
     def __init__(self, selection: str, threshold: float, top_k: int, **settings: Any) -> None:
         super().__init__(**settings)
-        rule = f"threshold must be a number in [-1, 1], got {threshold!r}"
-        require(*one_of(SELECTIONS, selection=selection), *at_least_one(top_k=top_k), (is_real(threshold, -1, 1), rule))
+        require(
+            *one_of(SELECTIONS, selection=selection),
+            *at_least_one(top_k=top_k),
+            (is_real(threshold, -1, 1), f"threshold must be a number in [-1, 1], got {threshold!r}"),
+        )
         self.selection = selection
         self.threshold = threshold
         self.top_k = top_k
@@ -65,14 +68,17 @@ class MaskSC(SelectedMasks):
 
     def choose(self) -> list[int]:
         """Return the slots that the selection names."""
-        earlier = range(self.num_combined)
+        earlier = list(range(self.num_combined))
         if self.selection == "similarity":
             return self._similar()
         if self.selection == "random":
-            return torch.randperm(len(earlier), generator=self.generator, device="cpu")[: self.top_k].tolist()
-        if self.selection in ("all", "none"):
-            return [*earlier] if self.selection == "all" else []
-        tasks = ct_graphs([*map(self.task_in, (*earlier, self.slot))], self.selection)
+            order = torch.randperm(self.num_combined, generator=self.generator, device="cpu")
+            return order[: self.top_k].tolist()
+        if self.selection == "all":
+            return earlier
+        if self.selection == "none":
+            return []
+        tasks = ct_graphs([self.task_in(slot) for slot in (*earlier, self.slot)], self.selection)
         family = [slot for slot in earlier if is_prefix(tasks[slot], tasks[-1])]
         return family if self.selection == "depth_prefix" else family[-1:]
 
@@ -80,9 +86,13 @@ class MaskSC(SelectedMasks):
         known = self.embeddings.of_slot
         if self.slot not in known:
             return []
-        cosines = {slot: float(known[slot] @ known[self.slot]) for slot in range(self.num_combined) if slot in known}
-        near = [slot for slot, cosine in cosines.items() if cosine > self.threshold]
-        return sorted(near, key=lambda slot: -cosines[slot])[: self.top_k]
+        near = {}
+        for slot in range(self.num_combined):
+            if slot in known:
+                cosine = float(known[slot] @ known[self.slot])
+                if cosine > self.threshold:
+                    near[slot] = cosine
+        return sorted(near, key=lambda slot: -near[slot])[: self.top_k]
 
 
 def is_prefix(one: Task, other: Task) -> bool:
@@ -93,5 +103,5 @@ def is_prefix(one: Task, other: Task) -> bool:
 
 def _without_number(images: Any) -> Any:
     """Return images with the number of them set to 1, where it is theirs to say."""
-    given = [each.name for each in getattr(images, "__dataclass_fields__", {}).values() if each.init]
-    return replace(images, num_images=1) if "num_images" in given else images
+    number = getattr(images, "__dataclass_fields__", {}).get("num_images")
+    return replace(images, num_images=1) if number is not None and number.init else images

@@ -41,7 +41,8 @@ class GRUModel:
     def learn(self, transitions: Transitions) -> None:
         """See `Predictor`; minibatches of 16 rows."""
         for _ in range(NUM_EPOCHS):
-            for rows in torch.randperm(len(transitions.pair), generator=self.generator, device="cpu").split(16):
+            order = torch.randperm(len(transitions.pair), generator=self.generator, device="cpu")
+            for rows in order.split(16):
                 batch = Transitions(*(each[rows] for each in transitions))
                 minimise(self.optimiser, self._nats(batch).mean())
 
@@ -52,4 +53,5 @@ class GRUModel:
 
     def _nats(self, transitions: Transitions) -> Tensor:
         memory, _ = self.gru(self.embedding(transitions.context))
-        return cross_entropy(self.head(memory).movedim(-1, 1), transitions.pair, reduction="none")
+        logits = self.head(memory).movedim(-1, 1)
+        return cross_entropy(logits, transitions.pair, reduction="none")

@@ -32,7 +32,8 @@ def distinct(inputs: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         return frames, frames
     widths = [value.shape[1] for value in flat]
     weights = random_weights(sum(widths)).split(widths)
-    sums = torch.stack([value.float() @ part for value, part in zip(flat, weights, strict=True)]).sum(dim=0)
+    parts = [value.float() @ weight for value, weight in zip(flat, weights, strict=True)]
+    sums = torch.stack(parts).sum(dim=0)
     different, groups = sums.unique(return_inverse=True)
     examples = frames.new_empty(len(different)).scatter_(0, groups, frames)
     if len(examples) == len(frames):
@@ -45,14 +46,16 @@ def distinct(inputs: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
 def renumbered(groups: Tensor) -> tuple[Tensor, Tensor]:
     """Return what `distinct` does of some of its frames, from the groups that it gave them, int64 [num_frames]."""
     different, numbers = groups.unique(return_inverse=True)
-    examples = torch.empty_like(different).scatter_(0, numbers, torch.arange(len(groups), device="cpu"))
+    frames = torch.arange(len(groups), device="cpu")
+    examples = torch.empty_like(different).scatter_(0, numbers, frames)
     return examples, numbers
 
 
 @cache
 def random_weights(count: int) -> Tensor:
     """Return random numbers, float32 [count], always the same."""
-    return torch.randn(count, generator=torch.Generator(device="cpu").manual_seed(0), dtype=torch.float32, device="cpu")
+    generator = torch.Generator(device="cpu").manual_seed(0)
+    return torch.randn(count, generator=generator, dtype=torch.float32, device="cpu")
 
 
 class Histories(NamedTuple):
@@ -87,8 +90,10 @@ def histories(groups: Tensor, starts: Tensor, state: CellState) -> Histories:
     branches = []
     count = 0
     for frames in found.frames.split(found.sizes.tolist()):
-        different, places = (last[: len(frames)] * num_groups + flat[frames]).unique(return_inverse=True)
-        branches.append((different.div(num_groups, rounding_mode="floor"), different % num_groups))
+        longer = last[: len(frames)] * num_groups + flat[frames]
+        different, places = longer.unique(return_inverse=True)
+        shorter = different.div(num_groups, rounding_mode="floor")
+        branches.append((shorter, different % num_groups))
         of_frames[frames] = places + count
         last = places
         count = count + len(different)

@@ -37,9 +37,11 @@ def transitions(observation: Tensor, action: Tensor, reward: Tensor, num_actions
         float32 [N, n], n = pixels + num_actions + 1.
     """
     pixels = observation.flatten(1).float()
+    centred = pixels - pixels.mean()
     deviation = pixels.std(correction=0)
-    pixels = (pixels - pixels.mean()) / torch.where(deviation > 0, deviation, 1.0)
-    return torch.cat([pixels, one_hot(action, num_actions).float(), reward.float().unsqueeze(1)], dim=1)
+    standardised = centred / torch.where(deviation > 0, deviation, 1.0)
+    actions = one_hot(action, num_actions).float()
+    return torch.cat([standardised, actions, reward.float().unsqueeze(1)], dim=1)
 
 
 def with_last(recent: Mapping[str, Tensor], batch: TensorDictBase, most: int) -> dict[str, Tensor]:
@@ -54,7 +56,8 @@ def with_last(recent: Mapping[str, Tensor], batch: TensorDictBase, most: int) ->
 
 def sampled_points(recent: Mapping[str, Tensor], number: int, num_actions: int, generator: torch.Generator) -> Tensor:
     """Draw some of what `with_last` returned, without replacement, as points; see `transitions`."""
-    drawn = torch.randperm(len(recent["action"]), generator=generator, device="cpu")[:number]
+    order = torch.randperm(len(recent["action"]), generator=generator, device="cpu")
+    drawn = order[:number]
     reward = recent["reward"][drawn].squeeze(-1)
     return transitions(recent["observation"][drawn], recent["action"][drawn], reward, num_actions)
 
@@ -68,7 +71,8 @@ def reference_points(number: int, width: int, seed: int = REFERENCE_SEED) -> Ten
 def unit_directions(number: int, width: int, seed: int = REFERENCE_SEED) -> Tensor:
     """Return directions drawn uniformly from the unit sphere, float32 [L, n]; the same for equal arguments."""
     generator = torch.Generator(device="cpu").manual_seed(seed)
-    return normalize(torch.randn(number, width, generator=generator, dtype=torch.float32, device="cpu"), dim=1)
+    directions = torch.randn(number, width, generator=generator, dtype=torch.float32, device="cpu")
+    return normalize(directions, dim=1)
 
 
 def linear_wasserstein(points: Tensor, reference: Tensor) -> Tensor:
@@ -85,13 +89,15 @@ def linear_wasserstein(points: Tensor, reference: Tensor) -> Tensor:
     Returns:
         float32 [M * n].
     """
-    distinct, counts = points.cpu().double().unique(dim=0, return_counts=True)
-    targets = reference.cpu().double()
+    x, counts = points.cpu().double().unique(dim=0, return_counts=True)
+    r = reference.cpu().double()
     number = len(reference)
-    cost = (targets.square().sum(1, keepdim=True) - 2 * targets @ distinct.T + distinct.square().sum(1)).numpy()
-    plan = optimal_plan(cost, np.full(number, len(points)), (number * counts).numpy())
-    means = torch.from_numpy(plan).double() @ distinct / len(points)
-    return ((means - targets) / math.sqrt(number)).flatten().to(points)
+    squares = r.square().sum(1, keepdim=True)
+    cost = squares - 2 * r @ x.T + x.square().sum(1)
+    mass = np.full(number, len(points))
+    plan = optimal_plan(cost.numpy(), mass, (number * counts).numpy())
+    means = torch.from_numpy(plan).double() @ x / len(points)
+    return ((means - r) / math.sqrt(number)).flatten().to(points)
 
 
 def sliced_wasserstein(points: Tensor, directions: Tensor, num_quantiles: int) -> Tensor:
@@ -127,8 +133,8 @@ def sliced_distances(samples: Tensor, other: Tensor, directions: Tensor) -> Tens
     Returns:
         float [...].
     """
-    moved = _sorted_projections(samples, directions) - _sorted_projections(other, directions)
-    return moved.square().mean(dim=(-2, -1)).sqrt()
+    differences = _sorted_projections(samples, directions) - _sorted_projections(other, directions)
+    return differences.square().mean(dim=(-2, -1)).sqrt()
 
 
 def _sorted_projections(samples: Tensor, directions: Tensor) -> Tensor:
@@ -136,4 +142,6 @@ def _sorted_projections(samples: Tensor, directions: Tensor) -> Tensor:
 
     NumPy sorts them, which takes a twentieth of PyTorch's time.
     """
-    return torch.from_numpy(np.sort((directions @ samples.mT).cpu().numpy())).to(samples.device)
+    projections = directions @ samples.mT
+    in_order = np.sort(projections.cpu().numpy())
+    return torch.from_numpy(in_order).to(samples.device)

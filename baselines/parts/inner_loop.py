@@ -49,7 +49,9 @@ from ctgraph_rl.learn.collect import UNSTORED
 
 OUTER = ("trpo", "ppo")
 
-ACTIONS, REWARDS, EPISODES = f"{UNSTORED}actions", f"{UNSTORED}rewards", f"{UNSTORED}episodes"
+ACTIONS = f"{UNSTORED}actions"
+REWARDS = f"{UNSTORED}rewards"
+EPISODES = f"{UNSTORED}episodes"
 """What a row has done since its trial began, [rows, steps]; the number of an episode that is not needed is 0."""
 
 RIDGE = 1e-5
@@ -106,16 +108,21 @@ class Played(NamedTuple):
     def baseline(self, net: GatedNetwork, gamma: float) -> Tensor:
         """Fit the weights of b, float64 [trials, features]."""
         inputs = self.features(net) * (self.number > 0).unsqueeze(-1)
-        squares = inputs.mT @ inputs + RIDGE * torch.eye(inputs.shape[-1], dtype=inputs.dtype, device=inputs.device)
-        return torch.linalg.solve(squares, inputs.mT @ self.returns(gamma).double().unsqueeze(-1)).squeeze(-1)
+        ridge = RIDGE * torch.eye(inputs.shape[-1], dtype=inputs.dtype, device=inputs.device)
+        squares = inputs.mT @ inputs + ridge
+        returns = self.returns(gamma).double().unsqueeze(-1)
+        return torch.linalg.solve(squares, inputs.mT @ returns).squeeze(-1)
 
     def advantage(self, net: GatedNetwork, gamma: float, baseline: Tensor) -> Tensor:
         """Compute A, 0 where padded, [trials, steps]."""
         counts = (self.number > 0).double()
         number = counts.sum(dim=1, keepdim=True)
-        raw = self.returns(gamma) - (self.features(net) @ baseline.unsqueeze(-1)).squeeze(-1)
-        centred = counts * (raw - (counts * raw).sum(dim=1, keepdim=True) / number)
-        std = ((centred**2).sum(dim=1, keepdim=True) / number).sqrt()
+        predicted = (self.features(net) @ baseline.unsqueeze(-1)).squeeze(-1)
+        raw = self.returns(gamma) - predicted
+        mean = (counts * raw).sum(dim=1, keepdim=True) / number
+        centred = counts * (raw - mean)
+        variance = (centred**2).sum(dim=1, keepdim=True) / number
+        std = variance.sqrt()
         return (centred / (std + SMALLEST_STD)).to(self.reward.dtype)
 
     def episodes(self, net: GatedNetwork, gamma: float, before: Played) -> Episodes:
@@ -127,7 +134,8 @@ class Played(NamedTuple):
 def places(begins: Tensor) -> tuple[Tensor, Tensor]:
     """Return the place of each step, and that of the last one up to it that ``begins``, int64 [trials, steps] each."""
     place = torch.arange(begins.shape[1], device=begins.device).expand_as(begins)
-    return place, torch.where(begins, place, 0).cummax(dim=1).values
+    first = torch.where(begins, place, 0).cummax(dim=1).values
+    return place, first
 
 
 def log_prob(logits: Tensor, action: Tensor) -> Tensor:
@@ -145,7 +153,8 @@ class InnerModel(nn.Module):
 
     def __init__(self, net: GatedNetwork, inner_rate: float) -> None:
         super().__init__()
-        self.net, self.inner_rate = net, inner_rate
+        self.net = net
+        self.inner_rate = inner_rate
 
     @property
     def theta(self) -> NamedWeights:
@@ -172,7 +181,8 @@ class InnerModel(nn.Module):
 
     def adapted_logits(self, theta: NamedWeights, before: Episodes, seen: NetInputs) -> Tensor:
         """Compute the logits of one trial's steps after its adaptation, [steps, num_actions]."""
-        return self.logits(theta, self.adapt(theta, self.start(theta), before), seen)
+        own = self.adapt(theta, self.start(theta), before)
+        return self.logits(theta, own, seen)
 
 
 class InnerPolicy(TensorDictModuleBase):
@@ -187,7 +197,9 @@ class InnerPolicy(TensorDictModuleBase):
 
     def __init__(self, model: InnerModel, seen_keys: list[str], adapt_episodes: int, gamma: float) -> None:
         super().__init__()
-        self.model, self.adapt_episodes, self.gamma = model, adapt_episodes, gamma
+        self.model = model
+        self.adapt_episodes = adapt_episodes
+        self.gamma = gamma
         self.seen_keys = seen_keys
         self.kept_keys = [f"{UNSTORED}{key}" for key in seen_keys]
         self.own_keys = {name: f"{UNSTORED}{name}" for name in model.start(model.theta)}
@@ -197,17 +209,18 @@ class InnerPolicy(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` and the next state."""
-        model, theta = self.model, {name: value.detach() for name, value in self.model.theta.items()}
+        theta = {name: value.detach() for name, value in self.model.theta.items()}
         begins = tensordict["is_init"].squeeze(-1)
         episode = tensordict["trial"].squeeze(-1) + begins
         fresh = begins & ((episode == 1) | (episode > 2 * self.adapt_episodes))
         episode = torch.where(fresh, 1, episode)
-        rewards = torch.cat([tensordict[REWARDS], tensordict["reward"]], dim=1)
-        rewards = rewards[:, rewards.shape[1] - tensordict[EPISODES].shape[1] :]  # those of the steps that are kept
         adapts = begins & (episode == self.adapt_episodes + 1)
+        num_kept = tensordict[EPISODES].shape[1]
+        rewards = torch.cat([tensordict[REWARDS], tensordict["reward"]], dim=1)
+        rewards = rewards[:, rewards.shape[1] - num_kept :]
         own = self._own(theta, tensordict, rewards, fresh=fresh, adapts=adapts)
         seen = tuple(tensordict[key] for key in self.seen_keys)
-        logits = vmap(model.logits, in_dims=(None, 0, 0))(theta, own, seen)
+        logits = vmap(self.model.logits, in_dims=(None, 0, 0))(theta, own, seen)
         action = logits.argmax(dim=-1) if is_greedy() else draw(logits.softmax(dim=-1))
         tensordict.set("action", guided(tensordict, action))
         tensordict.set(("next", "trial"), episode.unsqueeze(-1))
@@ -224,7 +237,8 @@ class InnerPolicy(TensorDictModuleBase):
             played = Played(seen, data[ACTIONS][adapts], rewards[adapts], data[EPISODES][adapts])
             theirs = {name: value[adapts] for name, value in own.items()}
             adapted = vmap(self.model.adapt, in_dims=(None, 0, 0))(theta, theirs, self.before(played))
-            own = {name: value.index_put((adapts,), adapted[name]) for name, value in own.items()}
+            for name, value in adapted.items():
+                own[name] = own[name].index_put((adapts,), value)
         for name, first in self.model.start(theta).items():
             own[name] = torch.where(beside(fresh, own[name]), first, own[name])
         return own
@@ -241,10 +255,10 @@ class InnerPolicy(TensorDictModuleBase):
         needed = (numbers > 0).any(dim=0)
         first = int((needed.cumsum(dim=0) == 0).sum())
         data.set(("next", EPISODES), numbers[:, first:])
-        data.set(("next", ACTIONS), torch.cat([data[ACTIONS], data["action"].unsqueeze(-1)], dim=1)[:, first:])
         data.set(("next", REWARDS), rewards[:, first:])
-        for key, kept in zip(self.seen_keys, self.kept_keys, strict=True):
-            data.set(("next", kept), torch.cat([data[kept], data[key].unsqueeze(1)], dim=1)[:, first:])
+        for kept, key in zip((ACTIONS, *self.kept_keys), ("action", *self.seen_keys), strict=True):
+            steps = torch.cat([data[kept], data[key].unsqueeze(1)], dim=1)
+            data.set(("next", kept), steps[:, first:])
 
 
 class InnerLoop(Learner):
@@ -318,10 +332,14 @@ class InnerLoop(Learner):
         )
         short = f"num_steps must be at least the 2 * adapt_episodes={2 * adapt_episodes} episodes of a trial"
         require((num_steps >= 2 * adapt_episodes, f"{short}, got {num_steps}"))
-        self.adapt_episodes, self.trial_episodes = adapt_episodes, 2 * adapt_episodes
+        self.adapt_episodes = adapt_episodes
+        self.trial_episodes = 2 * adapt_episodes
         self.num_context = num_context
         self.entropy_coeff = entropy_coeff
-        self.outer, self.max_kl, self.clip_epsilon, self.num_epochs = outer, max_kl, clip_epsilon, num_epochs
+        self.outer = outer
+        self.max_kl = max_kl
+        self.clip_epsilon = clip_epsilon
+        self.num_epochs = num_epochs
         num_actions = num_actions_of(action_spec)
         require_gated_weights(observation_spec, hidden_size, num_layers, num_context=num_context, gate_size=gate_size)
         self.specs = shown_specs(observation_spec)
@@ -350,9 +368,13 @@ class InnerLoop(Learner):
         """Return the state before the first trial; it lasts over episodes, as it has a key ``trial``."""
         theta = self.model.theta
         like = next(iter(theta.values())).detach()
-        state = {"trial": like.new_zeros(num_envs, 1, dtype=torch.int64), "reward": like.new_zeros(num_envs, 1)}
-        state |= {key: like.new_zeros(num_envs, 0, dtype=torch.int64) for key in (ACTIONS, EPISODES)}
-        state[REWARDS] = like.new_zeros(num_envs, 0)
+        state = {
+            "trial": like.new_zeros(num_envs, 1, dtype=torch.int64),
+            "reward": like.new_zeros(num_envs, 1),
+            ACTIONS: like.new_zeros(num_envs, 0, dtype=torch.int64),
+            EPISODES: like.new_zeros(num_envs, 0, dtype=torch.int64),
+            REWARDS: like.new_zeros(num_envs, 0),
+        }
         for key, spec in self.specs.items():
             state[f"{UNSTORED}{key}"] = torch.zeros(num_envs, 0, *spec.shape, dtype=spec.dtype, device=like.device)
         for name, value in self.model.start(theta).items():
@@ -363,7 +385,8 @@ class InnerLoop(Learner):
         """Yield the whole trials of a batch, if it has any, as often as the outer loop takes a step on them."""
         trials = self.trials(batch)
         if trials is not None:
-            yield from [trials] * (1 if self.outer == "trpo" else self.num_epochs)
+            for _ in range(1 if self.outer == "trpo" else self.num_epochs):
+                yield trials
 
     @torch.no_grad()
     def trials(self, batch: TensorDictBase) -> Items | None:
@@ -381,7 +404,8 @@ class InnerLoop(Learner):
         whole = (own & ends[rows]).any(dim=1)
         if not whole.any():
             return None
-        rows, own = rows[whole], own[whole]
+        rows = rows[whole]
+        own = own[whole]
         is_before = number[rows] <= self.adapt_episodes
         before = self._played(batch, rows, own & is_before)
         after = self._played(batch, rows, own & ~is_before)
@@ -390,39 +414,45 @@ class InnerLoop(Learner):
         found |= self._as_data(after.episodes(self.model.net, policy.gamma, before))
         found["log_prob"] = log_prob(self._adapted_logits(found), found["action"])
         for name, played in (("before", before), ("after", after)):
-            found["measured", name] = (played.reward * (played.number > 0)).sum() / len(rows) / self.adapt_episodes
+            total = (played.reward * (played.number > 0)).sum()
+            found["measured", name] = total / len(rows) / self.adapt_episodes
         return found
 
     def _played(self, batch: TensorDictBase, rows: Tensor, chosen: Tensor) -> Played:
         """Return some steps of rows, which follow each other; ``chosen`` is bool [trials, steps of the batch]."""
         count = chosen.sum(dim=1, keepdim=True)
         place = torch.arange(int(count.max()), device=rows.device)
-        steps = (chosen.int().argmax(dim=1, keepdim=True) + place).clamp(max=chosen.shape[1] - 1)
-        at = rows.unsqueeze(-1), steps
+        first = chosen.int().argmax(dim=1, keepdim=True)
+        steps = (first + place).clamp(max=chosen.shape[1] - 1)
+        at = (rows.unsqueeze(-1), steps)
         number = torch.where(place < count, batch["next", "trial"].squeeze(-1)[at], 0)
         seen = tuple(batch[key][at] for key in self.specs)
         return Played(seen, batch["action"][at], batch["next", "reward"].squeeze(-1)[at], number)
 
     def _as_data(self, episodes: Episodes, *labels: str) -> Items:
         """Return episodes by key."""
-        keys = *self.specs, *Episodes._fields[1:]
-        values = *episodes.seen, *episodes[1:]
+        keys = (*self.specs, *Episodes._fields[1:])
+        values = (*episodes.seen, *episodes[1:])
         return {(*labels, key) if labels else key: value for key, value in zip(keys, values, strict=True)}
 
     def _adapted_logits(self, batch: Data, theta: NamedWeights | None = None) -> Tensor:
         """Compute the logits of all trials after their adaptation, [trials, steps, num_actions]."""
-        seen = tuple(batch["before", key] for key in self.specs)
-        before = Episodes(seen, *(batch["before", key] for key in Episodes._fields[1:]))
+        others = [batch["before", key] for key in Episodes._fields[1:]]
+        before = Episodes(self._seen_before(batch), *others)
         after = tuple(batch[key] for key in self.specs)
         return vmap(self.model.adapted_logits, in_dims=(None, 0, 0))(theta or self.model.theta, before, after)
+
+    def _seen_before(self, batch: Data) -> NetInputs:
+        """Return what the network reads of the steps before the adaptation."""
+        return tuple(batch["before", key] for key in self.specs)
 
     def loss(self, batch: Data) -> TensorsByName:
         """Compute the outer loss of what `trials` returned, and that of the entropy before the adaptation."""
         losses = {"loss_policy": self._outer_loss(batch, self._adapted_logits(batch))}
         if self.entropy_coeff > 0:
             theta = self.model.theta
-            seen = tuple(batch["before", key] for key in self.specs)
-            entropies = entropy(self.model.logits(theta, self.model.start(theta), seen).log_softmax(dim=-1))
+            logits = self.model.logits(theta, self.model.start(theta), self._seen_before(batch))
+            entropies = entropy(logits.log_softmax(dim=-1))
             weight = -self.entropy_coeff * batch["before", "weight"]
             losses["loss_entropy"] = (weight * entropies).sum(dim=1).mean()
         return losses
@@ -447,6 +477,9 @@ class InnerLoop(Learner):
                 weight=batch["weight"] / len(batch["weight"]),
                 max_kl=self.max_kl,
             )
-        trials = torch.full_like(batch["measured", "after"], len(batch["action"]))
-        returns = {f"return_{name}": batch["measured", name] for name in ("before", "after")}
-        return {**measured, **returns, "trials": trials}
+        return {
+            **measured,
+            "return_before": batch["measured", "before"],
+            "return_after": batch["measured", "after"],
+            "trials": torch.full_like(batch["measured", "after"], len(batch["action"])),
+        }
