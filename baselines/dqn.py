@@ -109,11 +109,10 @@ class DQN(QLearner):
             gamma = later.new_tensor(self.gamma) ** batch["steps_to_next_obs"].view_as(batch["next", "reward"])
             running = (~batch["next", "terminated"]).int()
             target = (batch["next", "reward"] + gamma * running * later.gather(-1, best)).squeeze(-1)
-            squared = (predicted - target).square()
-        loss = (predicted - target).square()
+        squared = (predicted - target).square()
         weight = batch.get("priority_weight")
-        mean = loss.mean() if weight is None else (loss * weight).sum() / weight.sum()
-        return {"loss_value": mean, "td_error": squared}
+        mean = squared.mean() if weight is None else (squared * weight).sum() / weight.sum()
+        return {"loss_value": mean, "td_error": squared.detach()}
 
     def values(self, data: Data) -> Tensor:
         """Compute the online network's action values."""

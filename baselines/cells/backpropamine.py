@@ -96,8 +96,15 @@ class Backpropamine(Cell):
         rate = None if self.modulation == "simple" else self.rate
         if self.modulation == "none":
             return Plastic(self.recurrent, self.plasticity, rate)
-        modulator = (self.modulator.weight, self.modulator.bias)
-        return Plastic(self.recurrent, self.plasticity, rate, *modulator, self.fan_out.weight, self.fan_out.bias)
+        return Plastic(
+            self.recurrent,
+            self.plasticity,
+            rate,
+            modulator=self.modulator.weight,
+            modulator_bias=self.modulator.bias,
+            fan_out=self.fan_out.weight,
+            fan_out_bias=self.fan_out.bias,
+        )
 
     def _step(self, given: Tensor, state: CellState, product: Tensor | None = None) -> CellOutput:
         """Take a step from the inputs times their weights, [rows, H]; ``product`` is overwritten."""

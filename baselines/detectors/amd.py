@@ -31,7 +31,8 @@ from ctgraph_rl.checks import (
 
 DEGREES = ("published", "corrected")
 
-IMPOSSIBLE, PENALTY = 1e-8, 10.0
+IMPOSSIBLE = 1e-8
+PENALTY = 10.0
 """Where less than the first is expected, PENALTY * O^2 is added in place of (O - E)^2 / E."""
 
 
@@ -156,9 +157,9 @@ class AMD(Detector):
 
     def triples(self, seen: Seen) -> Tensor:
         """Return number of the history, action and next observation of each step, row after row, int64 [N, 3]."""
-        ids, action, following = _needed(seen)
+        action = seen.action
         before = torch.cat([self.last_action.unsqueeze(1), action[:, :-1]], dim=1)
-        pairs = torch.where(seen.is_init, 0, before) * self.num_observations + ids + 1
+        pairs = torch.where(seen.is_init, 0, before) * self.num_observations + cast(Tensor, seen.observation_id) + 1
         begins = torch.cat([torch.zeros_like(self.recent, dtype=torch.bool), seen.is_init], dim=1)
         lags = [torch.cat([self.recent, pairs], dim=1)]
         for _ in range(1, self.order):
@@ -167,7 +168,8 @@ class AMD(Detector):
         history = sum(each * (self.num_outcomes + 1) ** lag for lag, each in enumerate(lags))[:, self.order - 1 :]
         self.last_action = action[:, -1].clone()
         self.recent = torch.stack([each[:, -1] for each in reversed(lags)], dim=1)[:, 1:]
-        return torch.stack([history, action, following], dim=-1).flatten(0, 1)
+        steps = [history, action, cast(Tensor, seen.next_observation_id)]
+        return torch.stack(steps, dim=-1).flatten(0, 1)
 
     def _learn(self, steps: Tensor) -> None:
         """Count steps, int64 [N, 3], for the present label."""
@@ -255,11 +257,6 @@ class Counts:
             return torch.zeros_like(numbers)
         places = torch.searchsorted(self.keys, numbers).clamp(max=len(self.keys) - 1)
         return torch.where(self.keys[places] == numbers, self.counts[places], 0)
-
-
-def _needed(seen: Seen) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the observation of each step, its action and the next observation."""
-    return cast(Tensor, seen.observation_id), seen.action, cast(Tensor, seen.next_observation_id)
 
 
 def statistic(observed: Tensor, expected: Tensor) -> Tensor:

@@ -166,13 +166,20 @@ class Mosaic(MaskExchange):
         own = self._own_return(member)
         if not best:
             return []
-        share = 0.5 + 0.5 * min(max(own, 0.0), LARGEST_RETURN) if self.own_share is None else self.own_share
+        share = self.own_share
+        if share is None:
+            share = 0.5 + 0.5 * min(max(own, 0.0), LARGEST_RETURN)
         self.methods[member].receive(torch.stack([each.content["scores"] for each in best]), share)
         helps = []
         for each in best:
-            values = {"task_id": self.task_of(member), "return_before": own, "own_share": share}
-            values["return_of_sender"] = each.content["reward"]
-            helps.append(Help(each.sender, member, {**values, **_of(each, "similarity")}))
+            values = {
+                "task_id": self.task_of(member),
+                "return_before": own,
+                "own_share": share,
+                "return_of_sender": each.content["reward"],
+                "similarity": each.content["similarity"],
+            }
+            helps.append(Help(each.sender, member, values))
         return helps
 
     def _queries(self, member: int) -> list[Message]:

@@ -100,7 +100,8 @@ class MaskAMSC(SelectedMasks):
 
     def _trained(self) -> float:
         """Return the mean return of the episodes that ended in the last batches; 0 if none did."""
-        total, number = (sum(each) for each in zip(*self.returns, strict=True)) if self.returns else (0.0, 0)
+        total = sum(returns for returns, _ in self.returns)
+        number = sum(count for _, count in self.returns)
         return total / max(number, 1)
 
     def _evaluated(self) -> float:
@@ -126,15 +127,16 @@ class MaskAMSC(SelectedMasks):
         earlier = [slot for slot in range(self.num_combined) if slot in known]
         if self.slot not in known or not earlier:
             return []
-        given = similarities(known[self.slot], torch.stack([known[slot] for slot in earlier]), self.distance)
-        given = standardised(given) if self.z_score else given
-        able = given.new_tensor(
-            [self.episodes == "none" or self.competence[slot] > 0 for slot in earlier], dtype=torch.bool
-        )
+        t = similarities(known[self.slot], torch.stack([known[slot] for slot in earlier]), self.distance)
+        if self.z_score:
+            t = standardised(t)
+        has_learned = [self.episodes == "none" or self.competence[slot] > 0 for slot in earlier]
+        able = t.new_tensor(has_learned, dtype=torch.bool)
         candidates = torch.tensor(earlier, dtype=torch.int64, device="cpu")[able]
-        support = candidates[sparsemax(given[able] / self.temperature) > 0]
+        support = candidates[sparsemax(t[able] / self.temperature) > 0]
         if self.shuffled:
-            support = candidates[torch.randperm(len(candidates), generator=self.shuffle, device="cpu")[: len(support)]]
+            order = torch.randperm(len(candidates), generator=self.shuffle, device="cpu")
+            support = candidates[order[: len(support)]]
         return support.tolist()
 
     def get_extra_state(self) -> NamedValues:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from baselines.methods.parts.masks import Masks
+from baselines.methods.parts.masks import Masks, zero_betas
 from baselines.methods.parts.weights import Weights, flat
 from baselines.parts.learner import Learner
 from ctgraph_rl.checks import NamedValues, at_least_one, require
@@ -45,9 +45,7 @@ class MaskShared(Masks):
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`."""
         self.num_actions = most_actions(curriculum.tasks)
-        self.betas = nn.Parameter(
-            torch.zeros(len(weights.parameters), self.max_received + 1, dtype=torch.float32, device="cpu")
-        )
+        self.betas = zero_betas(weights, self.max_received + 1)
         self._keep(torch.zeros(0, len(weights), dtype=torch.float32, device="cpu"))
         super().setup(agent, weights, curriculum)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from itertools import chain
 from typing import Any, cast
 
 import torch
@@ -107,10 +106,11 @@ class Encoder(nn.Module):
     def forward(self, observation: Tensor, *extra: Tensor) -> Tensor:
         """Map uint8 [..., *shape] and further inputs, [..., n] each, to [..., num_features] of the weights' dtype."""
         dtype = self.linear.weight.dtype
-        flat = observation.flatten(-self.event_dims).to(dtype) * self.scale
-        flat = flat if self.convolutions is None else self.convolutions(flat)
-        flat = torch.cat([flat, *(values.to(dtype) for values in extra)], dim=-1) if extra else flat
-        return self.further(self.linear(flat).relu())
+        inputs = observation.flatten(-self.event_dims).to(dtype) * self.scale
+        if self.convolutions is not None:
+            inputs = self.convolutions(inputs)
+        inputs = joined(inputs, *(values.to(dtype) for values in extra))
+        return self.further(self.linear(inputs).relu())
 
 
 class EncoderModule(TensorDictModule):
@@ -127,12 +127,14 @@ class EncoderModule(TensorDictModule):
     def groups(self, data: Data) -> Tensor:
         """Number the different inputs of frames, [rows, steps] of them; int64 [rows, steps]."""
         inputs = [data[key] for key in self.in_keys]
-        return distinct([value.flatten(0, 1) for value in inputs])[1].view(inputs[0].shape[:2])
+        _, groups = distinct([value.flatten(0, 1) for value in inputs])
+        return groups.view(inputs[0].shape[:2])
 
     def of_distinct(self, data: Data) -> tuple[Tensor, Tensor]:
         """Compute features of different frames, [n, num_features], and which of them each has, int64 [num_frames]."""
         examples, groups = renumbered(data[GROUP])
-        return self.module(*(data[key].index_select(0, examples) for key in self.in_keys)), groups
+        features = self.module(*(data[key].index_select(0, examples) for key in self.in_keys))
+        return features, groups
 
 
 class RecurrentModule(TensorDictModuleBase):
@@ -165,15 +167,18 @@ class RecurrentModule(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``memory`` and the next state of a step; in TorchRL's ``recurrent_mode``, ``memory`` of sequences."""
-        return tensordict.update({"memory": self.over_time(tensordict)} if recurrent_mode() else self.act(tensordict))
+        written = {"memory": self.over_time(tensordict)} if recurrent_mode() else self.act(tensordict)
+        return tensordict.update(written)
 
     def act(self, data: Data) -> Items:
         """Compute ``memory`` and the next state for one step of all rows."""
-        encoder = self.encoder
-        cell = self.cell
+        inputs = joined(self.encoder.over_time(data), *self._own(data))
         state = reset([data[key] for key in self.state_keys], data["is_init"].squeeze(-1))
-        memory, state = cell.step(joined(encoder.over_time(data), *self._own(data)), state)
-        return {"memory": memory, **{("next", key): value for key, value in zip(self.state_keys, state, strict=True)}}
+        memory, state = self.cell.step(inputs, state)
+        written: Items = {"memory": memory}
+        for key, value in zip(self.state_keys, state, strict=True):
+            written["next", key] = value
+        return written
 
     def over_time(self, data: Data) -> Tensor:
         """Compute ``memory`` at all steps of [rows, steps], from the state at the first; reset at ``is_init``.
@@ -193,7 +198,9 @@ class RecurrentModule(TensorDictModuleBase):
 
     def groups(self, data: Data) -> Tensor:
         """Number the different inputs of frames, [rows, steps] of them; int64 [rows, steps]."""
-        return distinct([*chain(*self._read(data))])[1].view(data["is_init"].shape[:2])
+        seen, own = self._read(data)
+        _, groups = distinct([*seen, *own])
+        return groups.view(data["is_init"].shape[:2])
 
     def _read(self, data: Data) -> tuple[list[Tensor], list[Tensor]]:
         """Return what the encoder reads at all frames, [rows * steps, ...] each, and what the cell reads beside it."""
@@ -202,12 +209,11 @@ class RecurrentModule(TensorDictModuleBase):
 
     def _sequences(self, data: Data) -> tuple[Tensor, Tensor, Tensor, CellState]:
         """Return what the cell reads, one for all frames with the same inputs; see `Cell.sequence`."""
-        encoder = self.encoder
         starts = data["is_init"].squeeze(-1)
-        read = self._read(data)
-        examples, groups = renumbered(data[GROUP].flatten()) if GROUP in data else distinct([*chain(*read)])
-        seen, own = ([value.index_select(0, examples) for value in values] for values in read)
-        inputs = joined(encoder.module(*seen), *own)
+        seen, own = self._read(data)
+        examples, groups = renumbered(data[GROUP].flatten()) if GROUP in data else distinct([*seen, *own])
+        features = self.encoder.module(*(value.index_select(0, examples) for value in seen))
+        inputs = joined(features, *(value.index_select(0, examples) for value in own))
         state = reset([data[key][:, 0] for key in self.state_keys], starts[:, 0])
         return inputs, groups.view_as(starts), starts, state
 
@@ -223,9 +229,11 @@ class RecurrentModule(TensorDictModuleBase):
 
     def _own(self, data: Data) -> list[Tensor]:
         """Return the last action, one-hot, and the last reward, as far as the cell reads them; 0 at ``is_init``."""
-        if not self.own_keys:
-            return []
-        return [own_input(key, data[key], self.cell.num_actions) * ~data["is_init"] for key in self.own_keys]
+        found = []
+        for key in self.own_keys:
+            value = one_hot(data[key], self.cell.num_actions).float() if key == PREVIOUS_ACTION else data[key]
+            found.append(value * ~data["is_init"])
+        return found
 
 
 def trunk_of(policy: object) -> Any:
@@ -237,11 +245,6 @@ def trunk_of(policy: object) -> Any:
 def joined(features: Tensor, *others: Tensor) -> Tensor:
     """Concatenate features with further inputs, [..., n] each."""
     return torch.cat([features, *others], dim=-1) if others else features
-
-
-def own_input(key: str, value: Tensor, num_actions: int) -> Tensor:
-    """Return an agent's last action or reward as an input, float32 [..., n]."""
-    return one_hot(value, num_actions).float() if key == PREVIOUS_ACTION else value
 
 
 def copied_action(keys: Sequence[str]) -> list[TensorDictModule]:

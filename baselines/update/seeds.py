@@ -197,12 +197,11 @@ class SeedGroup:
     def _learn_stacked(self, parts: Sequence[TensorDictBase]) -> list[Learnt]:
         for method, part in zip(self.methods, parts, strict=False):
             method.on_batch(part)
-        numbered = iter(range(len(parts)))
-        return [
-            measured
-            for stack in self.stacks
-            for measured in self._learn_at_once(stack, [next(numbered) for _ in stack.learners], parts)
-        ]
+        measured: list[Learnt] = []
+        for stack in self.stacks:
+            numbers = range(len(measured), len(measured) + len(stack.learners))
+            measured += self._learn_at_once(stack, numbers, parts)
+        return measured
 
     def _learn_at_once(self, stack: Stack, numbers: Sequence[int], parts: Sequence[TensorDictBase]) -> list[Learnt]:
         """Let some of the agents learn as one stack."""
@@ -231,7 +230,8 @@ class SeedGroup:
         for number, iterator in minibatches.items():
             with self.random(number):
                 minibatch = next(iterator, None)
-                given += [] if minibatch is None else [self.learners[number].method.transform_minibatch(minibatch)]
+                if minibatch is not None:
+                    given.append(self.learners[number].method.transform_minibatch(minibatch))
         return given
 
     def _update(

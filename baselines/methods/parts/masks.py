@@ -179,9 +179,7 @@ class CombinedMasks(Masks):
 
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`."""
-        self.betas = nn.Parameter(
-            torch.zeros(len(weights.parameters), self.num_ids(curriculum), dtype=torch.float32, device="cpu")
-        )
+        self.betas = zero_betas(weights, self.num_ids(curriculum))
         super().setup(agent, weights, curriculum)
 
     @property
@@ -211,6 +209,11 @@ class CombinedMasks(Masks):
             return super().current_scores()
         old = self.weights.split(self.scores[..., :earlier, :])
         return list(map(combined, self.betas[..., : earlier + 1].unbind(-2), old, self.own))
+
+
+def zero_betas(weights: Weights, count: int) -> nn.Parameter:
+    """Return numbers b that are 0, so many of each weight tensor."""
+    return nn.Parameter(torch.zeros(len(weights.parameters), count, dtype=torch.float32, device="cpu"))
 
 
 def _masked(scores: Tensor, constant: Tensor) -> Tensor:

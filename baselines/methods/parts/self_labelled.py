@@ -16,6 +16,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from baselines.detectors.seen import SUSPICION, Seen, Verdict
+from baselines.methods.method import multi_task_blocks
 from baselines.parts.networks import sequences_of, trunk_of
 from ctgraph_rl.agent import Agent, MethodLike
 from ctgraph_rl.checks import NamedValues, require
@@ -52,7 +53,7 @@ class SelfLabelled:
         detector = type(self.detector).__name__
         method = type(self.method).__name__
         hidden = how.boundaries == "hidden" or self.detector.is_oracle
-        several = [number for number, block in enumerate(curriculum.blocks, 1) if len(set(block.tasks)) > 1]
+        several = multi_task_blocks(curriculum)
         reads = getattr(self.method, "reads_tasks", "")
         room = self.num_labels(curriculum)
         wants = len(curriculum.tasks) if self.detector.is_oracle else 0
