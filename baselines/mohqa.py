@@ -28,7 +28,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
-from torch.func import functional_call
 from torch.nn.functional import one_hot
 from torchrl.data import Composite, TensorSpec
 from torchrl.modules import EGreedyModule
@@ -117,10 +116,10 @@ class HebbianHead(nn.Module):
         place = y.argsort(dim=-1).argsort(dim=-1)
         largest = place >= y.shape[-1] - number
         smallest = place < number
-        row = self.change * (largest.to(y.dtype) - smallest.to(y.dtype)) - self.fall * (~(largest | smallest)).to(
-            y.dtype
-        )
-        return self.decay * before + one_hot(action, len(self.weights)).unsqueeze(-1) * row.unsqueeze(-2)
+        others = ~(largest | smallest)
+        row = self.change * (largest.to(y.dtype) - smallest.to(y.dtype)) - self.fall * others.to(y.dtype)
+        taken = one_hot(action, len(self.weights)).unsqueeze(-1)
+        return self.decay * before + taken * row.unsqueeze(-2)
 
     def modulate(self, eligibility: Tensor, reward: Tensor) -> None:
         """Change the weights step by step.
@@ -203,19 +202,12 @@ class Target(WithTarget):
         network: a sequence of trunk and head.
     """
 
-    def __init__(self, network: TensorDictSequential) -> None:
-        super().__init__(network)
-        self.in_keys = network.in_keys
-        self.out_keys = ["features", "action_value"]
-
     def outputs(self, data: Data) -> tuple[Tensor, Tensor]:
         """Compute phi and q with the target network's weights."""
         trunk, head = self.value_network
-        weights = self.target_value_network_params
-        of_trunk = weights["module", "0", "module"].flatten_keys(".")
-        of_head = weights["module", "1", "module"].flatten_keys(".")
-        features = functional_call(trunk.module, dict(of_trunk.items()), tuple(data[key] for key in trunk.in_keys))
-        return features, functional_call(head.module, dict(of_head.items()), (features,))
+        with self.target_value_network_params.to_module(self.value_network, preserve_module_state=False):
+            features = trunk.over_time(data)
+            return features, head.module(features)
 
 
 class MOHQA(QLearner):
