@@ -13,7 +13,7 @@ from torchrl.data import Composite, TensorSpec
 from baselines.parts.learner import MOST_PASSES
 from baselines.parts.networks import Data, TensorsByName
 from baselines.parts.policy_gradient import PolicyGradient, critic_loss, entropy_loss
-from ctgraph_rl.checks import Rule, at_least_one, at_most, is_int, not_negative, positive, require
+from ctgraph_rl.checks import at_least_one, at_most, is_int, not_negative, positive, require
 
 
 class PPO(PolicyGradient):
@@ -51,7 +51,10 @@ class PPO(PolicyGradient):
             *at_most(MOST_PASSES, num_epochs=num_epochs),
         )
         super().__init__(observation_spec, action_spec, **settings)
-        require(self._split_rule(num_minibatches))
+        items = self.num_envs if self.memory else self.num_envs * self.num_steps
+        what = f"num_envs={self.num_envs}" if self.memory else f"num_envs * num_steps = {items}"
+        splits = is_int(num_minibatches, 1) and items % num_minibatches == 0
+        require((splits, f"{what} must be a multiple of num_minibatches={num_minibatches}"))
         self.num_epochs = num_epochs
         self.num_minibatches = num_minibatches
         self.entropy_coeff = entropy_coeff
@@ -71,10 +74,3 @@ class PPO(PolicyGradient):
             "loss_critic": critic_loss(values, batch, self.critic_coeff),
             **entropy_loss(log_probs, self.entropy_coeff),
         }
-
-    def _split_rule(self, num_minibatches: int) -> Rule:
-        """Rule that minibatches split the rows, or the frames, evenly."""
-        items = self.num_envs if self.memory else self.num_envs * self.num_steps
-        what = f"num_envs={self.num_envs}" if self.memory else f"num_envs * num_steps = {items}"
-        splits = is_int(num_minibatches, 1) and items % num_minibatches == 0
-        return splits, f"{what} must be a multiple of num_minibatches={num_minibatches}"

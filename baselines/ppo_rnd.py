@@ -211,14 +211,12 @@ class PPORND(PPO):
     def minibatches(self, batch: TensorDictBase) -> Iterator[Items]:
         """Yield the minibatches of all epochs; predictor and critic of the bonus learn from each before PPO does."""
         for minibatch in super().minibatches(batch):
-            self._bonus_step(minibatch, minibatch.pop("next_observation"), minibatch.pop("bonus_target"))
+            observations = minibatch.pop("next_observation")
+            target = minibatch.pop("bonus_target")
+            used = max(1, round(self.predictor_share * len(observations)))  # the frames are shuffled
+            error = (self.bonus_values(minibatch) - target).square().mean()
+            minimise(self.bonus_optimiser, error + self.novelty(observations[:used]).mean())
             yield minibatch
-
-    def _bonus_step(self, minibatch: Data, observations: Tensor, target: Tensor) -> None:
-        """Take a gradient step of the bonus's critic on a minibatch, and of the predictor on part of it."""
-        used = max(1, round(self.predictor_share * len(observations)))  # the frames are shuffled
-        error = (self.bonus_values(minibatch) - target).square().mean()
-        minimise(self.bonus_optimiser, error + self.novelty(observations[:used]).mean())
 
     @torch.no_grad()
     def _with_advantage(self, batch: TensorDictBase) -> TensorsByName:

@@ -89,15 +89,12 @@ class MaskExchange(Exchange):
                 lack.append(f"member {number} has {type(method).__name__}: take method={self.method}")
         needs = f"{name} needs masks, which {len(lack)} of {len(agents)} members lack"
         require((not lack, "; ".join([needs, *lack[:1]])))
-        self._check_networks()
-        self.returns: list[dict[int, float]] = [{} for _ in agents]
-
-    def _check_networks(self) -> None:
         first = self.methods[0].constant
         others = sum(not torch.equal(first, method.constant) for method in self.methods)
-        needs = f"{type(self).__name__} needs one network behind all masks"
+        needs = f"{name} needs one network behind all masks"
         have = f"{others} of {len(self.methods)} members have another than member 0"
         require((not others, f"{needs}, and {have}: set method.backbone_seed"))
+        self.returns: list[dict[int, float]] = [{} for _ in agents]
 
     def takes(self, method: Masks) -> bool:
         """Return whether it can exchange the masks of a method."""

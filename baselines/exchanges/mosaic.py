@@ -143,9 +143,13 @@ class Mosaic(MaskExchange):
         self.kinds = {**self.kinds, "query": query}
 
     def send(self, kind: str, member: int, received: Sequence[Message]) -> Sequence[Message]:
-        """Send queries, and answer what was received."""
+        """Send queries, none without an embedding, and answer what was received."""
         if kind == "query":
-            return self._queries(member)
+            embedding = self.known[member].embedding
+            if embedding is None:
+                return []
+            content = {"task": self.task_of(member), "reward": self._own_return(member), "embedding": embedding}
+            return to_all(kind, member, self.num_members, content)
         if kind == "offer":
             offers: list[Message] = []
             for query in received:
@@ -181,14 +185,6 @@ class Mosaic(MaskExchange):
             }
             helps.append(Help(each.sender, member, values))
         return helps
-
-    def _queries(self, member: int) -> list[Message]:
-        """Return a query to every other member; none without an embedding."""
-        embedding = self.known[member].embedding
-        if embedding is None:
-            return []
-        content = {"task": self.task_of(member), "reward": self._own_return(member), "embedding": embedding}
-        return to_all("query", member, self.num_members, content)
 
     def _offers(self, member: int, query: Message) -> list[Message]:
         """Return an offer to who asked, if the tasks are similar and the member's return is higher."""

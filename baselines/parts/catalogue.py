@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 from argparse import ArgumentParser
 from collections.abc import Iterator
-from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -58,8 +57,10 @@ def catalogue(group: str, config_dir: Path | None = None) -> Iterator[CatalogueE
         group: such as ``agent``.
         config_dir: a further directory like ``conf``.
     """
-    folders = [Path(conf_dir()), *filter(None, [config_dir])]
-    for path in chain(*(sorted(Path(folder, group).glob("*.yaml")) for folder in folders)):
+    paths = sorted(Path(conf_dir(), group).glob("*.yaml"))
+    if config_dir is not None:
+        paths += sorted(Path(config_dir, group).glob("*.yaml"))
+    for path in paths:
         text = path.read_text(encoding="utf-8")
         settings = yaml.safe_load(text)
         if "_target_" in settings:
@@ -72,31 +73,24 @@ def catalogue(group: str, config_dir: Path | None = None) -> Iterator[CatalogueE
 def constants(target: str) -> NamedValues:
     """Return what the body of a class of `baselines`, or of one of its bases there, sets to constants."""
     module, _, name = target.rpartition(".")
-    tree = _parse_module(module)
-    classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
-    homes = dict(_imported(tree)) | dict.fromkeys(classes, module)
-    found: NamedValues = {}
-    for base in map(ast.unparse, reversed(classes[name].bases)):
-        home = homes.get(base, "")
-        if home.startswith("baselines."):
-            found |= constants(f"{home}.{base}")
-    return found | dict(_assigned(classes[name]))
-
-
-def _parse_module(module: str) -> ast.Module:
-    return ast.parse(ROOT.joinpath(*module.split(".")).with_suffix(".py").read_text(encoding="utf-8"))
-
-
-def _imported(tree: ast.Module) -> Iterator[tuple[str, str]]:
-    """Yield names that a module imports, each with the module that it is of."""
-    for node in tree.body:
+    path = ROOT.joinpath(*module.split(".")).with_suffix(".py")
+    homes: dict[str, str] = {}
+    classes: dict[str, ast.ClassDef] = {}
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
         if isinstance(node, ast.ImportFrom):
-            yield from ((alias.name, node.module or "") for alias in node.names)
-
-
-def _assigned(node: ast.ClassDef) -> Iterator[tuple[str, Any]]:
-    """Yield name and value of the constants in the body of a class."""
-    for line in node.body:
+            for alias in node.names:
+                homes[alias.name] = f"{node.module}.{alias.name}"
+        elif isinstance(node, ast.ClassDef):
+            homes[node.name] = f"{module}.{node.name}"
+            classes[node.name] = node
+    found: NamedValues = {}
+    for base in reversed(classes[name].bases):
+        home = homes.get(ast.unparse(base), "")
+        if home.startswith("baselines."):
+            found |= constants(home)
+    for line in classes[name].body:
         if isinstance(line, (ast.Assign, ast.AnnAssign)) and isinstance(line.value, ast.Constant):
             targets = line.targets if isinstance(line, ast.Assign) else [line.target]
-            yield from ((ast.unparse(target), line.value.value) for target in targets)
+            for each in targets:
+                found[ast.unparse(each)] = line.value.value
+    return found

@@ -167,20 +167,19 @@ class PolicyGradient(Learner):
     def evaluate_actions(self, batch: Data) -> tuple[Tensor, Tensor, Tensor]:
         """Compute log-probabilities of all actions, those of the actions taken, and values, with the present networks.
 
-        The trunk runs once for actor and critic.
+        The trunk runs once for actor and critic, and with ``deduplicate`` once for frames that have the same features.
         """
-        outputs = self._distinct_outputs(batch) if GROUP in batch else self.outputs(batch)
+        if GROUP in batch:
+            features, which = self.trunk.of_distinct(batch)
+            outputs = {key: value[which] for key, value in self._heads(features).items()}
+        else:
+            outputs = self.outputs(batch)
         log_probs = outputs["log_probs"]
         return log_probs, log_probs.gather(-1, batch["action"].unsqueeze(-1)), outputs["state_value"]
 
     def outputs(self, data: Data) -> TensorsByName:
         """Compute log-probabilities of all actions and the value; see `Learner`."""
         return self._heads(self.trunk.over_time(data))
-
-    def _distinct_outputs(self, data: Data) -> TensorsByName:
-        """Compute `outputs` once for frames with the same inputs, or with memory the same history."""
-        features, which = self.trunk.of_distinct(data)
-        return {key: value[which] for key, value in self._heads(features).items()}
 
     def _heads(self, features: Tensor) -> TensorsByName:
         return {"log_probs": log_probabilities(self.actor, features), "state_value": self.critic.module(features)}

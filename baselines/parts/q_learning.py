@@ -172,7 +172,12 @@ class QLearner(Learner):
             self.multi_step = MultiStep(gamma, n_steps)
         self.multi_step.done_keys = ()  # so that the end of an episode is known where the target reaches it
         self.prioritized = self.priority_alpha != 0
-        self.replay = make_replay(self.num_items(buffer_size), batch_size, self.priority_alpha, self.priority_beta)
+        size = self.num_items(buffer_size)
+        sampler = (
+            PrioritySampler(size, self.priority_alpha, self.priority_beta) if self.prioritized else RandomSampler()
+        )
+        storage = LazyTensorStorage(size)
+        self.replay = TensorDictReplayBuffer(storage=storage, sampler=sampler, batch_size=batch_size)
 
     def num_items(self, num_steps: int) -> int:
         """Return how many items of the replay buffer hold so many steps."""
@@ -255,10 +260,16 @@ class QLearner(Learner):
         raise NotImplementedError
 
     def minibatches(self, batch: TensorDictBase) -> Iterator[Items]:
-        """Store a batch, and yield minibatches of replayed items."""
+        """Store a batch, and yield minibatches of replayed items, as ``replay.sample()`` does, in plain tensors."""
         self.replay.extend(self.experience(self.with_targets(batch)))
+        storage = self.replay.storage
+        device = next(self.parameters()).device
         for _ in range(self.num_updates):
-            self.replayed, items = self._sample()
+            self.replayed, more = self.replay.sampler.sample(storage, self.minibatch_size)
+            stored = storage._storage.items(True, True)  # the buffer stays on the CPU
+            items = {key: value.index_select(0, self.replayed).to(device) for key, value in stored}
+            for key, value in more.items():
+                items[key] = value.to(device)
             yield items
 
     def after_update(self, measured: TensorsByName) -> TensorsByName:
@@ -280,15 +291,6 @@ class QLearner(Learner):
         """Whether the target network gets the weights after the next gradient step."""
         return self.prioritized or self.target_update.counter == self.target_update.value_network_update_interval
 
-    def _sample(self) -> tuple[Tensor, Items]:
-        """Return indices of replayed items and the items, as ``replay.sample()`` does, in plain tensors."""
-        storage = self.replay.storage
-        device = next(self.parameters()).device
-        index, more = self.replay.sampler.sample(storage, self.minibatch_size)
-        stored = storage._storage.items(True, True)
-        items = {key: value.index_select(0, index).to(device) for key, value in stored}  # the buffer stays on the CPU
-        return index, {**items, **{key: value.to(device) for key, value in more.items()}}
-
     def get_extra_state(self) -> NamedValues:
         """Return the optimiser's state, the replay buffer and the age of the target network in gradient steps."""
         replay = self.replay.state_dict()
@@ -302,9 +304,3 @@ class QLearner(Learner):
         super().set_extra_state(state)
         self.replay.load_state_dict(state["replay"])
         self.target_update.counter = state["target_age"]
-
-
-def make_replay(num_items: int, batch_size: int, alpha: float, beta: float) -> TensorDictReplayBuffer:
-    """Return a replay buffer, prioritized if ``alpha`` is not 0."""
-    sampler = PrioritySampler(num_items, alpha, beta) if alpha else RandomSampler()
-    return TensorDictReplayBuffer(storage=LazyTensorStorage(num_items), sampler=sampler, batch_size=batch_size)

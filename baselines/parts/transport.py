@@ -69,7 +69,10 @@ class _Transport:
         return units
 
     def _shortest_path(self, source: int) -> tuple[int, Arcs, Arcs]:
-        """Return the nearest column that needs more, and the arcs of the path to it, forward and backward."""
+        """Return the nearest column that needs more, and the arcs of the path to it, forward and backward.
+
+        The potentials change, so that the path has reduced costs of 0.
+        """
         rows, columns = self.reduced.shape
         distance = self.reduced[source].copy()
         came_from = np.full(columns, source)
@@ -95,14 +98,10 @@ class _Transport:
                 shorter = through < distance  # never a column that is done
                 distance[shorter] = ahead[shorter] = through[shorter]
                 came_from[shorter] = new[best[shorter]]
-        self._reduce(least - row_distance, np.where(done, least - distance, 0.0))
-        return column, *_arcs(source, column, came_from, came_by)
-
-    def _reduce(self, of_rows: Floats, of_columns: Floats) -> None:
-        """Change the potentials, so that the shortest path has reduced costs of 0."""
-        self.reduced -= of_rows.clip(min=0.0)[:, None]  # of rows that were not reached it is -inf
-        self.reduced += of_columns
+        self.reduced -= (least - row_distance).clip(min=0.0)[:, None]  # of rows that were not reached it is -inf
+        self.reduced += np.where(done, least - distance, 0.0)
         self.reduced.clip(min=0.0, out=self.reduced)  # rounding
+        return column, *_arcs(source, column, came_from, came_by)
 
 
 def _arcs(source: int, column: int, came_from: Ints, came_by: Ints) -> tuple[Arcs, Arcs]:

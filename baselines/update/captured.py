@@ -182,13 +182,9 @@ class CapturedGroup(SeedGroup):
         for method in self.methods:
             method.after_learning()
         columns = table_of(steps).cpu().unbind(2)
-        largest = self._largest_weights().cpu()
-        return [or_error(finite_means, list(steps[0]), *each) for each in zip(columns, largest, strict=True)]
-
-    def _largest_weights(self) -> Tensor:
-        """Return the size of the largest weight of each seed, [seeds]."""
         weights = [self.stack.kept[name].detach().flatten(1) for name in self.stack.learned]
-        return torch.stack([each.abs().amax(dim=1) for each in weights]).amax(dim=0)
+        largest = torch.stack([each.abs().amax(dim=1) for each in weights]).amax(dim=0).cpu()
+        return [or_error(finite_means, list(steps[0]), *each) for each in zip(columns, largest, strict=True)]
 
     @torch.no_grad()
     def _items(self, batch: TensorDictBase) -> TensorsByName:

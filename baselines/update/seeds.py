@@ -185,19 +185,14 @@ class SeedGroup:
     def learnt(self, batch: TensorDictBase) -> list[Learnt]:
         """Learn, and return what `learn` does; an agent that failed keeps weights that are not finite."""
         parts = batch.chunk(len(self.agents))
-        return self._learn_stacked(parts) if self.is_stacked else self._learn_in_turn(parts)
-
-    def _learn_in_turn(self, parts: Sequence[TensorDictBase]) -> list[Learnt]:
-        measured = []
-        for number, (agent, part) in enumerate(zip(self.agents, parts, strict=True)):
-            with self.random(number):
-                measured.append(or_error(agent.learn, part))
-        return measured
-
-    def _learn_stacked(self, parts: Sequence[TensorDictBase]) -> list[Learnt]:
+        measured: list[Learnt] = []
+        if not self.is_stacked:
+            for number, (agent, part) in enumerate(zip(self.agents, parts, strict=True)):
+                with self.random(number):
+                    measured.append(or_error(agent.learn, part))
+            return measured
         for method, part in zip(self.methods, parts, strict=False):
             method.on_batch(part)
-        measured: list[Learnt] = []
         for stack in self.stacks:
             numbers = range(len(measured), len(measured) + len(stack.learners))
             measured += self._learn_at_once(stack, numbers, parts)

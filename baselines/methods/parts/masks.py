@@ -5,8 +5,7 @@ Ben-Iwhiwhu et al. 2023 (TMLR, arXiv 2212.11110), on the supermasks of Wortsman 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -62,7 +61,8 @@ class Masks(TaskMethod):
         scores = weights.zeros().repeat(self.num_tasks, 1)
         own = self.initial_scores()
         if self.backbone_seed is not None:
-            with _seeded(self.backbone_seed):
+            with torch.random.fork_rng(devices=[]):  # agents are built from torch's global generator of the CPU
+                torch.default_generator.manual_seed(self.backbone_seed)
                 agent.reset_parameters()
                 scores = torch.stack([flat(self.initial_scores()) for _ in range(self.num_tasks)])
             own = [part.clone() for part in weights.split(scores[0])]
@@ -231,14 +231,6 @@ def _signed_constant(parameter: Tensor) -> Tensor:
     if parameter.ndim < 2:
         return torch.zeros_like(parameter)
     return parameter.sign() * (2 / parameter[0].numel()) ** 0.5
-
-
-@contextmanager
-def _seeded(seed: int) -> Iterator[None]:
-    """Let torch's global generator of the CPU, from which agents are built, be that of a seed."""
-    with torch.random.fork_rng(devices=[]):
-        torch.default_generator.manual_seed(seed)
-        yield
 
 
 def _drawn_scores(parameter: Tensor) -> Tensor:

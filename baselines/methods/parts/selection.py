@@ -91,15 +91,14 @@ class TaskEmbeddings:
         if len(self.recent["action"]) < self.num_samples:
             return
         points = sampled_points(self.recent, self.num_samples, num_actions, generator)
-        new = normalize(self._embed(points), dim=0)
-        old = self.of_slot.get(slot, new)
-        self.of_slot[slot] = normalize((old + new) / 2, dim=0)
-
-    def _embed(self, points: Tensor) -> Tensor:
         width = points.shape[1]
         if self.embedding == "lwe":
-            return linear_wasserstein(points, reference_points(self.num_references, width))
-        return sliced_wasserstein(points, unit_directions(self.num_directions, width), self.num_quantiles)
+            found = linear_wasserstein(points, reference_points(self.num_references, width))
+        else:
+            found = sliced_wasserstein(points, unit_directions(self.num_directions, width), self.num_quantiles)
+        new = normalize(found, dim=0)
+        old = self.of_slot.get(slot, new)
+        self.of_slot[slot] = normalize((old + new) / 2, dim=0)
 
     def state(self) -> NamedValues:
         """Return embeddings and buffer."""

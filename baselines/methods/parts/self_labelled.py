@@ -15,7 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from baselines.detectors.seen import SUSPICION, Seen, Verdict
+from baselines.detectors.seen import SUSPICION, Seen
 from baselines.methods.method import multi_task_blocks
 from baselines.parts.networks import sequences_of, trunk_of
 from ctgraph_rl.agent import Agent, MethodLike
@@ -210,7 +210,11 @@ class SelfLabelledAgent(nn.Module):
         verdict = self.detector.observe(self._seen(batch))
         measured: dict[str, float] = {"acted_label": self.label + 1, "learned": 0, "alarm": 0, "rolled_back": 0}
         if self.home is not None:
-            self._try(verdict, batch.numel())
+            self.num_tried += batch.numel()
+            if isinstance(verdict, int):
+                self._accept(verdict)
+            elif self.num_tried >= self.detector.patience:
+                self._try_next()
         elif verdict is SUSPICION:
             measured |= {"alarm": 1, "rolled_back": self._suspect()}
         else:
@@ -283,14 +287,6 @@ class SelfLabelledAgent(nn.Module):
         """Restore what was learned at the older snapshot, if there is one."""
         for snapshot in self.snapshots[:1]:
             self.learner.load_state_dict(deepcopy(snapshot["state"]))
-
-    def _try(self, verdict: Verdict, num_frames: int) -> None:
-        """Accept a label, or try the next one after so many frames."""
-        self.num_tried += num_frames
-        if isinstance(verdict, int):
-            self._accept(verdict)
-        elif self.num_tried >= self.detector.patience:
-            self._try_next()
 
     def _try_next(self) -> None:
         """Try the next label; after the last one open a new one, if there is room."""
