@@ -25,12 +25,7 @@ LABELS = {
     "maml": "MAML",
     "pearl": "PEARL",
 }
-GATES = {
-    "none": "",
-    "soft": ", soft gate",
-    "hard": ", hard gate (as released)",
-    "hard_straight_through": ", hard gate, straight through",
-}
+GATES = ("none", "soft", "hard", "hard_straight_through")
 SUCCESS = (0.0, 1.0)
 
 FULL = "full"
@@ -97,9 +92,9 @@ def runs(depth: int, kind: str = FULL) -> dict[tuple[str, ...], dict[tuple[str, 
     return {key: groups(of[key], "seed") for key in order}
 
 
-def label(agent: str, gate: str) -> str:
-    """Return what a row of a table is called."""
-    return LABELS[agent] + GATES[gate]
+def graph_label(depth: int, kind: str) -> str:
+    """Return what a graph is called in a table or above a panel."""
+    return str(depth) if kind == FULL else f"{depth}, {kind}"
 
 
 def first(lines: Raw) -> float:
@@ -141,27 +136,39 @@ def successes(depth: int, kind: str = FULL) -> dict[str, str]:
     return found
 
 
-def adaptation_table(depth: int, kind: str = FULL) -> str:
-    """Return a row for each agent and gate: means over seeds with their intervals; a row for the best search."""
+def adaptation_table(depth: int) -> str:
+    """Return a row for each agent without a gate: means over seeds with their intervals; a row for the best search."""
     rows = []
     best: Raw = []
-    for (agent, gate), of in runs(depth, kind).items():
-        seeds = list(of.values())
-        best = seeds[0]
-        rows.append(
-            [
-                label(agent, gate),
-                str(len(seeds)),
-                best[0]["frames"],
-                mean_of([first(lines) for lines in seeds], SUCCESS),
-                mean_of([adapted(lines) for lines in seeds], SUCCESS),
-                mean_of([regret(lines) for lines in seeds], bounds_of_regret(best)),
-            ]
-        )
-    if best:
-        rows.append(["*best search*", "exact", "-", best[0]["best_search"], "1.00", "0.00"])
+    for (agent, gate), of in runs(depth).items():
+        if gate == "none":
+            seeds = list(of.values())
+            best = seeds[0]
+            rows.append(
+                [
+                    LABELS[agent],
+                    str(len(seeds)),
+                    best[0]["frames"],
+                    mean_of([first(lines) for lines in seeds], SUCCESS),
+                    mean_of([adapted(lines) for lines in seeds], SUCCESS),
+                    mean_of([regret(lines) for lines in seeds], bounds_of_regret(best)),
+                ]
+            )
+    rows.append(["*best search*", "exact", "-", best[0]["best_search"], "1.00", "0.00"])
     head = ["agent", "seeds", "frames", "success in episode 1", "success after adaptation", "regret"]
     return table(head, rows)
+
+
+def gates_table(depth: int) -> str:
+    """Return a row for each agent with gates and a column for each gate: success after adaptation, mean over seeds."""
+    found = runs(depth)
+    agents = dict.fromkeys(agent for agent, gate in found if gate != "none")
+    rows = []
+    for agent in agents:
+        of_gates = [found.get((agent, gate), {}).values() for gate in GATES]
+        means = [mean_of([adapted(lines) for lines in seeds], SUCCESS) if seeds else "-" for seeds in of_gates]
+        rows.append([LABELS[agent], *means])
+    return table(["agent", *(f"`{gate}`" for gate in GATES)], rows)
 
 
 def draw(path: Path) -> None:
@@ -176,7 +183,7 @@ def draw(path: Path) -> None:
     panels[0].set_ylabel("share at the goal")
     legends = [axes.get_legend_handles_labels() for axes in panels]
     handles, labels = max(legends, key=lambda legend: len(legend[1]))
-    figure.legend(handles, labels, loc="outside upper left", ncols=5, fontsize=7)
+    figure.legend(handles, labels, loc="outside upper left", ncols=6, fontsize=7)
     save_figure(figure, path, 220)
 
 
@@ -186,24 +193,24 @@ def _draw_graph(axes: Any, depth: int, kind: str) -> None:
         of = runs(depth, kind).get((agent, "none"), {})
         for number, lines in enumerate(of.values()):
             success = [float(line["success"]) for line in lines]
-            name = label(agent, "none") if number == 0 else None
+            name = LABELS[agent] if number == 0 else None
             axes.plot(range(1, len(lines) + 1), success, color=f"C{position}", linewidth=0.9, label=name)
     best = [float(line["best_search"]) for line in lines_of(depth, kind)][: len(lines)]
     axes.plot(range(1, len(best) + 1), best, "k--", linewidth=1, label="best search")
     if kind == SURJECTIVE:
         axes.axhline(WITHOUT_MEMORY, color="0.5", linestyle=":", linewidth=1, label="most without memory")
-    axes.set_title(f"depth {depth}" if kind == FULL else f"depth {depth}, {kind}", fontsize=9)
+    axes.set_title(f"depth {graph_label(depth, kind)}", fontsize=9)
     axes.set(xlabel="episode of a row", ylim=(-0.05, 1.05))
 
 
-def table_of_depths(*depths: int) -> str:
-    """Return a row for each depth and agent with its success after adaptation: means over seeds with intervals."""
+def table_of_graphs(graphs: Sequence[tuple[int, str]]) -> str:
+    """Return a row for each graph and agent with its success after adaptation: means over seeds with intervals."""
     rows = []
-    for depth in depths:
-        for (agent, gate), of in runs(depth).items():
+    for depth, kind in graphs:
+        for (agent, _), of in runs(depth, kind).items():
             seeds = list(of.values())
             after = mean_of([adapted(lines) for lines in seeds], SUCCESS)
-            rows.append([str(depth), label(agent, gate), str(len(seeds)), seeds[0][0]["frames"], after])
+            rows.append([graph_label(depth, kind), LABELS[agent], str(len(seeds)), seeds[0][0]["frames"], after])
     return table(["depth", "agent", "seeds", "frames", "success after adaptation"], rows)
 
 
@@ -212,10 +219,10 @@ def page() -> str:
     text = (TEMPLATES / "adaptation.md").read_text(encoding="utf-8")
     return Template(text).substitute(
         successes(2) | successes(2, SURJECTIVE),
-        surjective=adaptation_table(2, SURJECTIVE),
+        gates=gates_table(2),
         without_memory=f"{WITHOUT_MEMORY:.3f}",
         depth_2=adaptation_table(2),
-        depth_1_and_3=table_of_depths(1, 3),
+        other_graphs=table_of_graphs([(1, FULL), (3, FULL), (2, SURJECTIVE)]),
         swap=adaptation_swap.swap_table(),
         rl2_swap=mean_of(adaptation_swap.shares("rl2", held_out=True), SUCCESS),
         penn_a_swap=mean_of(adaptation_swap.shares("penn_a", held_out=True), SUCCESS),

@@ -9,6 +9,8 @@ import pytest
 from studies import adaptation, adaptation_swap
 from studies.raw import read
 
+import curricula
+
 
 def curves(agent: str, gate: str = "none") -> list[list[float]]:
     """The success of each seed in each episode of a row."""
@@ -26,6 +28,22 @@ def test_agents_with_an_inner_loop_do_not_search_and_the_others_do():
         assert fmean(curve[20:]) < 0.8
     for curve in (*curves("pearl"), *curves("rl2")):
         assert fmean(curve[4:20]) > 0.5
+
+
+def test_only_rl2_exceeds_the_best_policy_without_memory_on_a_surjective_graph():
+    of_agents = adaptation.runs(2, adaptation.SURJECTIVE)
+    most = adaptation.WITHOUT_MEMORY
+    exceeds = {
+        agent: [adaptation.adapted(lines) > most for lines in of.values()] for (agent, _), of in of_agents.items()
+    }
+
+    assert exceeds == {agent: [agent == "rl2"] * 5 for agent in ("rl2", "cavia", "maml", "pearl")}
+
+
+def test_the_best_policy_without_memory_has_the_mean_of_the_ceilings_of_the_goals():
+    (block,) = curricula.load("nm_uniform_goals", kind="surjective").blocks
+
+    assert fmean(task.memoryless_ceiling() for task in block.tasks) == pytest.approx(adaptation.WITHOUT_MEMORY)
 
 
 def test_rl2_loses_success_in_late_episodes_of_three_seeds():
