@@ -40,16 +40,22 @@ def write_profile(paths: Sequence[Path | str], folder: Path | str, agents: Seque
     scores = profile_scores(paths, agents)
     folder = made_folder(Path(folder))
     titles = list(next(iter(scores.values())))
-    rows = [[agent, title, *each] for agent, of_agent in scores.items() for title, each in of_agent.items()]
-    write_whole(folder / "profile.csv", csv_text([COLUMNS, *rows]))
-    cells = [(agent, list(map(_cell, of_agent.values()))) for agent, of_agent in scores.items()]
+    rows: list[Sequence[Any]] = [COLUMNS]
+    cells = []
+    gaps = []
+    for agent, of_agent in scores.items():
+        cells.append((agent, list(map(_cell, of_agent.values()))))
+        for title, each in of_agent.items():
+            rows.append((agent, title, *each))
+            if each.reason:
+                gaps.append(markdown_text(f"{agent}, {title}: {each.reason}"))
+    write_whole(folder / "profile.csv", csv_text(rows))
     table = Table(f"Profile. {MEANING}", "profile", "agent", titles, cells)
     write_whole(folder / "profile.tex", f"{PREAMBLE}\n\n{latex(table)}\n")
     [drawn] = Gallery(folder).write((), _figures(scores, titles))  # which draws them in the report's style
-    shown = [[title, *(str(of_agent[title]) for of_agent in scores.values())] for title in titles]
-    page = ["# Profile", f"![{drawn.alt}]({drawn.path})", drawn.caption]
-    page.append(markdown_table(["property", *map(markdown_text, scores)], shown))
-    page += [markdown_text(f"{agent}, {title}: {reason}") for agent, title, *_, reason in rows if reason]
+    by_title = zip(titles, *(map(str, of_agent.values()) for of_agent in scores.values()), strict=True)
+    by_agent = markdown_table(["property", *map(markdown_text, scores)], by_title)
+    page = ["# Profile", f"![{drawn.alt}]({drawn.path})", drawn.caption, by_agent, *gaps]
     write_whole(folder / "profile.md", "\n\n".join(page) + "\n")
     return scores
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 from typing import Any, NamedTuple
 
 import torch
@@ -60,24 +61,27 @@ def _plain(task: Task) -> list[ImageLine]:
     lines = []
     for kind in StateType:
         ids = _first_ids(task, kind, COLUMNS)
-        lines.append(ImageLine(kind.name.lower(), _stored(task, ids), [str(number) for number in ids]))
+        lines.append(ImageLine(kind.name.lower(), _stored(task, ids), list(map(str, ids))))
     return lines
 
 
 def _varied(task: Task, seed: int) -> list[ImageLine]:
     """A line for each of the first ids of each kind of state."""
-    shown = [(kind, number) for kind in StateType for number in _first_ids(task, kind, MOST_IDS)]
+    shown: list[tuple[StateType, int]] = []
+    for kind in StateType:
+        shown += product([kind], _first_ids(task, kind, MOST_IDS))
     reads = _reads(task, shown, COLUMNS - 1, seed)
     lines = []
     for (kind, number), images in zip(shown, reads, strict=True):
+        label = f"{kind.name.lower()} {number}"
         words = ["image", *["read"] * len(images)]
-        lines.append(ImageLine(f"{kind.name.lower()} {number}", torch.cat([_stored(task, [number]), images]), words))
+        lines.append(ImageLine(label, torch.cat([_stored(task, [number]), images]), words))
     return lines
 
 
 def _first_ids(task: Task, kind: StateType, most: int) -> list[int]:
     first, last = task.observations.ids(kind)
-    return list(range(first, min(last, first + most - 1) + 1))
+    return list(range(first, last + 1)[:most])
 
 
 def _stored(task: Task, ids: list[int]) -> Tensor:
@@ -88,15 +92,16 @@ def _stored(task: Task, ids: list[int]) -> Tensor:
 def _reads(task: Task, shown: list[tuple[StateType, int]], count: int, seed: int) -> Tensor:
     """Observations of ids by an environment whose states show no other, uint8 [ids, count, *shape]."""
     rows: list[Task] = []
+    kinds: list[int] = []
     for kind, number in shown:
         rows += [_pinned(task, kind, number)] * count
+        kinds += [kind] * count
     env = CTGraphEnv(rows, seed)
     env.reset()
-    state = env.get_state()
-    kinds = state["state_type"].new_tensor([kind for kind, _ in shown]).repeat_interleave(count)
-    state["state_type"] = kinds
-    state["node"] = torch.where(kinds == StateType.END, task.graph.num_decision_states, 0)
-    env.rows.state = type(env.rows.state)(**state)
+    state = env.rows.state
+    state_type = state.state_type.new_tensor(kinds)
+    node = torch.where(state_type == StateType.END, task.graph.num_decision_states, 0)
+    env.rows.state = state._replace(state_type=state_type, node=node)
     return env.rows.show().observation.unflatten(0, (len(shown), count))
 
 
@@ -104,7 +109,8 @@ def _pinned(task: Task, kind: StateType, number: int) -> Task:
     """The task with one id for a kind of state."""
     name = kind.name.lower()
     changes: dict[str, Any] = {f"{name}_ids": (number, number)}
-    changes |= {f"unique_{name}s": False} if kind in (StateType.WAIT, StateType.DECISION, StateType.END) else {}
+    if task.observations.is_unique(kind):
+        changes[f"unique_{name}s"] = False
     return replace(task, observations=replace(task.observations, **changes))
 
 

@@ -8,7 +8,7 @@ less than they say.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import chain, combinations
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -62,11 +62,16 @@ def performance_profile(of_tasks: Scores, thresholds: np.ndarray, seed: int = 0)
         seed: of the bootstrap.
     """
     rng = np.random.default_rng(seed)
-    every = np.concatenate(list(of_tasks.values()))
     drawn = np.concatenate([_drawn(values, rng) for values in of_tasks.values()], axis=1)
     shares = np.stack([(drawn > threshold).mean(axis=1) for threshold in thresholds], axis=1)
     low, high = np.quantile(shares, TAILS, axis=0)
-    return Interval((every[:, None] > thresholds).mean(axis=0), low, high)
+    above = _pooled(of_tasks)[:, None] > thresholds
+    return Interval(above.mean(axis=0), low, high)
+
+
+def _pooled(of_tasks: Scores) -> np.ndarray:
+    """Return the scores of all tasks, float64 [tasks * seeds]."""
+    return np.concatenate(list(of_tasks.values()))
 
 
 def probability_of_improvement(first: Scores, second: Scores, seed: int = 0) -> Interval:
@@ -96,7 +101,8 @@ def _better(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the share of pairs in which the first is better, float64 [samples]; equal pairs count half."""
     one = first[:, :, None]
     other = second[:, None, :]
-    return np.asarray(((one > other) + 0.5 * (one == other)).mean(axis=(1, 2)))
+    points = (one > other) + 0.5 * (one == other)
+    return np.asarray(points.mean(axis=(1, 2)))
 
 
 def _shown(section: Section) -> list[Result]:
@@ -106,11 +112,12 @@ def _shown(section: Section) -> list[Result]:
 
 def profiles(section: Section) -> CaptionedFigure | None:
     """Return the performance profiles of all agents; None without two agents of enough seeds."""
-    if len(_shown(section)) < 2:
+    shown = _shown(section)
+    if len(shown) < 2:
         return None
     caption = (
         "Performance profiles: the share of runs and tasks whose mean return at the last evaluation is above a "
-        f"threshold. Bands: {BOOTSTRAP}.{left_out(len(_shown(section)), MOST_AGENTS, 'agents')}"
+        f"threshold. Bands: {BOOTSTRAP}.{left_out(len(shown), MOST_AGENTS, 'agents')}"
     )
     return CaptionedFigure("profiles", "Performance profiles", caption, draw_profiles(section))
 
@@ -118,7 +125,7 @@ def profiles(section: Section) -> CaptionedFigure | None:
 def draw_profiles(section: Section) -> Any:
     """Draw the performance profile of each agent."""
     shown = _shown(section)[:MOST_AGENTS]
-    every = np.concatenate(list(chain(*(scores(result).values() for result in shown))))
+    every = np.concatenate([_pooled(scores(result)) for result in shown])
     thresholds = np.linspace(min(0.0, every.min()), max(1.0, every.max()), THRESHOLDS)
     figure = new_figure(figure_width(), 2.5)
     axes = figure.subplots()
@@ -134,12 +141,13 @@ def draw_profiles(section: Section) -> Any:
 
 def improvements(section: Section) -> CaptionedFigure | None:
     """Return the probabilities of improvement of all pairs of agents; None without two agents of enough seeds."""
-    if len(_shown(section)) < 2:
+    shown = _shown(section)
+    if len(shown) < 2:
         return None
     caption = (
         "Probability of improvement: how likely a run of one agent has a higher mean return at the last evaluation "
         "than a run of the other, as a mean over tasks. Equal returns count half, so equal agents have 0.5. Bars: "
-        f"{BOOTSTRAP}.{left_out(len(_shown(section)), MOST_AGENTS, 'agents')}"
+        f"{BOOTSTRAP}.{left_out(len(shown), MOST_AGENTS, 'agents')}"
     )
     return CaptionedFigure("improvement", "Probability of improvement", caption, draw_improvements(section))
 
