@@ -24,6 +24,9 @@ from ctgraph_rl.core.tree import Swap, is_done
 from ctgraph_rl.tasks.switch import Switch
 from ctgraph_rl.tasks.task import Task
 
+RowData = dict[str, Tensor]
+"""What rows show, by key."""
+
 
 class CTGraphEnv(EnvBase):
     """A batch of CT-graphs, ``batch_size=[len(tasks)]``; every row has its own task.
@@ -108,7 +111,7 @@ class CTGraphEnv(EnvBase):
         self.register_buffer("_id_of_task", numbers, persistent=False)
         self._task_id: tuple[Tensor | None, Tensor] = None, numbers
         self._steps: list[TensorDictBase] | None = None
-        self._running: dict[str, Tensor] = {}
+        self._running: RowData = {}
         self._make_specs()
 
     def _make_specs(self) -> None:
@@ -282,7 +285,7 @@ class CTGraphEnv(EnvBase):
         self._steps.extend(steps)
         return [step.empty() for step in steps[:1]]
 
-    def step_data(self, action: Tensor | None, mask: Tensor | None = None) -> dict[str, Tensor]:
+    def step_data(self, action: Tensor | None, mask: Tensor | None = None) -> RowData:
         """Step all rows; return the data after the step by key, ``reward`` among them.
 
         This and `restart_data` are a step for loops that keep tensors. Values may share memory with each other and with
@@ -309,7 +312,7 @@ class CTGraphEnv(EnvBase):
         data["reward"] = reward.unsqueeze(-1)
         return data
 
-    def step_and_restart_data(self, action: Tensor | None) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    def step_and_restart_data(self, action: Tensor | None) -> tuple[RowData, RowData]:
         """Return what `step_data` returns, and then `restart_data` for the rows that are done; on CPUs in one call."""
         rows = self.rows
         stepped = None
@@ -327,7 +330,7 @@ class CTGraphEnv(EnvBase):
         after = {**self._data(shown.observation, done, self._running["done"], shown), "reward": rewards}
         return after, self._restarted(shown.following, done, self._running)
 
-    def restart_data(self, done: Tensor, observation: Tensor) -> dict[str, Tensor]:
+    def restart_data(self, done: Tensor, observation: Tensor) -> RowData:
         """Start an episode in the rows that are done; return the data that the next step starts from by key.
 
         Args:
@@ -336,7 +339,7 @@ class CTGraphEnv(EnvBase):
         """
         return self._restarted(self.rows.restart(done.squeeze(-1), observation), done, self._not_done())
 
-    def _data(self, observation: Tensor, done: Tensor, is_init: Tensor, shown: Shown | Stepped) -> dict[str, Tensor]:
+    def _data(self, observation: Tensor, done: Tensor, is_init: Tensor, shown: Shown | Stepped) -> RowData:
         """Return the rows' data by key, all but rewards; ``shown`` says where the rows that are done arrived."""
         data = {"observation": observation, "is_init": is_init, "done": done, "terminated": done}
         if self.info:
@@ -344,11 +347,11 @@ class CTGraphEnv(EnvBase):
             data |= {**ends, "truncated": torch.zeros_like(done)}
         return data | self._counts(shown if isinstance(shown, Stepped) else self.rows)
 
-    def _restarted(self, observation: Tensor, is_init: Tensor, running: dict[str, Tensor]) -> dict[str, Tensor]:
+    def _restarted(self, observation: Tensor, is_init: Tensor, running: RowData) -> RowData:
         """Return the rows' data after the finished ones have started an episode; see `_not_done`."""
         return {"observation": observation, "is_init": is_init, **running, **self._counts(self.rows)}
 
-    def _not_done(self) -> dict[str, Tensor]:
+    def _not_done(self) -> RowData:
         """Make what rows show that are not done, [N, 1] by key."""
         false = torch.zeros_like(self.rows.row, dtype=torch.bool).unsqueeze(-1)
         data = {"done": false, "terminated": false}
@@ -357,7 +360,7 @@ class CTGraphEnv(EnvBase):
             data |= {"outcome": false.to(torch.uint8), "leaf": leaf, "truncated": false.clone()}
         return data
 
-    def _counts(self, counts: Rows | Stepped) -> dict[str, Tensor]:
+    def _counts(self, counts: Rows | Stepped) -> RowData:
         """Return the rows' data that count over an episode, and their task ids."""
         keys = ("step_count", "episode_reward") if self.info else ()
         data = {key: getattr(counts, key).unsqueeze(-1) for key in keys}
@@ -372,7 +375,7 @@ class CTGraphEnv(EnvBase):
             self._task_id = self.rows.task, shown
         return shown
 
-    def _tensordict(self, data: dict[str, Tensor]) -> TensorDict:
+    def _tensordict(self, data: RowData) -> TensorDict:
         return TensorDict(_own(data), batch_size=self.batch_size, device=self.device)
 
     def render(self, size: int = 192) -> Tensor:
@@ -403,6 +406,6 @@ _SHARED = ("terminated", "step_count", "episode_reward", "reward", "task_id")
 """Data of rows whose memory is also that of other data or of the rows."""
 
 
-def _own(data: dict[str, Tensor]) -> dict[str, Tensor]:
+def _own(data: RowData) -> RowData:
     """Return data that may be written into: their memory is their own."""
     return {key: value.clone() if key in _SHARED else value for key, value in data.items()}

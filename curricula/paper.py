@@ -162,10 +162,10 @@ def dissimilar(configuration: str, num_frames: int = FRAMES, image_seed: int = 1
         image_seed: seed of the first image set; the others have the next three.
     """
     shown = axes.image_seeds(configured(configuration), _seeds(image_seed))
-    tasks = [
-        axes.reshaped(task, CTGraph(b, d, task.graph.wait_prob), KINDS[configuration], goal)
-        for task, ((b, d), goal) in zip(shown, DISSIMILAR.items(), strict=True)
-    ]
+    tasks = []
+    for task, ((b, d), goal) in zip(shown, DISSIMILAR.items(), strict=True):
+        graph = CTGraph(b, d, task.graph.wait_prob)
+        tasks.append(axes.reshaped(task, graph, KINDS[configuration], goal))
     return _curriculum(f"{configuration}_dissimilar", tasks, num_frames)
 
 
@@ -179,9 +179,7 @@ def new_decisions(configuration: str, num_frames: int = FRAMES, image_seed: int 
         num_frames: frames per task.
         image_seed: seed of the image set that all tasks share.
     """
-    tasks = axes.new_images(one_goal(configuration, image_seed), NUM_VARIATIONS, ("decision",))
-    version = _version(configuration, has_one_goal=True)
-    return _curriculum(f"{configuration}_new_decisions", tasks, num_frames, version)
+    return _with_new_images(configuration, "decision", num_frames, image_seed)
 
 
 def new_waits(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
@@ -194,9 +192,14 @@ def new_waits(configuration: str, num_frames: int = FRAMES, image_seed: int = 1)
         num_frames: frames per task.
         image_seed: seed of the image set that all tasks share.
     """
-    tasks = axes.new_images(one_goal(configuration, image_seed), NUM_VARIATIONS, ("wait",))
+    return _with_new_images(configuration, "wait", num_frames, image_seed)
+
+
+def _with_new_images(configuration: str, kind: str, num_frames: int, image_seed: int) -> Curriculum:
+    """One goal; states of a kind get new images with each task."""
+    tasks = axes.new_images(one_goal(configuration, image_seed), NUM_VARIATIONS, (kind,))
     version = _version(configuration, has_one_goal=True)
-    return _curriculum(f"{configuration}_new_waits", tasks, num_frames, version)
+    return _curriculum(f"{configuration}_new_{kind}s", tasks, num_frames, version)
 
 
 def similar_goals(name: str, depth: int, num_shared: int, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:

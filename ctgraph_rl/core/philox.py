@@ -13,6 +13,9 @@ from torch import Tensor
 
 from ctgraph_rl.core import kernel
 
+Words = tuple[Tensor, ...]
+"""Words of 32 bits, each an int64 tensor with values in [0, 2**32)."""
+
 _WORD = 0xFFFFFFFF
 _MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)
 _KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
@@ -24,21 +27,21 @@ the task, and what agents draw."""
 _STREAM_SHIFT = 28  # 16 streams of 2**28 blocks each
 
 
-def philox(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[Tensor, Tensor]) -> tuple[Tensor, ...]:
+def philox(counter: Words, key: Words) -> Words:
     """Philox4x32-10: four random words for a counter of four words and a key of two.
 
     Args:
-        counter: four int64 tensors of broadcastable shapes with values in [0, 2**32).
-        key: two int64 tensors, likewise.
+        counter: four words of broadcastable shapes.
+        key: two words, likewise.
 
     Returns:
-        Four int64 tensors with values in [0, 2**32).
+        Four words.
     """
     words = (*counter, *key)
     return kernel.philox(words) if kernel.takes(*words) else by_tensors(counter, key)
 
 
-def by_tensors(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[Tensor, Tensor]) -> tuple[Tensor, ...]:
+def by_tensors(counter: Words, key: Words) -> Words:
     """`philox` where there is no C code."""
     c0, c1, c2, c3 = counter
     k0, k1 = key
@@ -67,7 +70,7 @@ def _product(a: Tensor, b: Tensor | int) -> tuple[Tensor, Tensor]:
     return half >> 31, ((half & 0x7FFFFFFF) << 1) | (rest & 1)
 
 
-def draw(seed: Tensor, row: Tensor, tick: Tensor, stream: int, block: Tensor | int = 0) -> tuple[Tensor, ...]:
+def draw(seed: Tensor, row: Tensor, tick: Tensor, stream: int, block: Tensor | int = 0) -> Words:
     """Four random words per element for (seed, row, tick, stream, block).
 
     Args:

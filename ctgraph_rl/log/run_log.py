@@ -42,7 +42,7 @@ from ctgraph_rl.checks import NamedValues, ReadOnlyValues, as_path, require
 from ctgraph_rl.disk import cannot_write, open_own, read_regular, write_whole
 from ctgraph_rl.log.escape import csv_text
 from ctgraph_rl.log.measurement import check, parsed
-from ctgraph_rl.metrics import Column, Curves, Regime, RegimeTable
+from ctgraph_rl.metrics import Column, Curves, Regime, RegimeTable, Trained
 from ctgraph_rl.metrics.adaptation import Adaptation
 
 MOST_CELLS = 10**7
@@ -342,7 +342,7 @@ class RunLog:
             fields.append(torch.stack([_row([m.get(name) for m in row]) for row in last]))
         return Adaptation(*fields)
 
-    def curves(self, trained: Sequence[Sequence[int]] | None = None) -> Curves:
+    def curves(self, trained: Trained | None = None) -> Curves:
         """All evaluations of the curriculum's tasks in time order, those during blocks included.
 
         Args:
@@ -360,13 +360,11 @@ class RunLog:
         num_tasks = 1 + max(chain(*of_blocks))
         return Curves(self._matrix(points.values(), num_tasks), blocks, frames, of_blocks)
 
-    def regimes(self, trained: Sequence[Sequence[int]] | None = None) -> list[Regime]:
+    def regimes(self, trained: Trained | None = None) -> list[Regime]:
         """Return `regime_table` as a list of regimes."""
         return list(self.regime_table(trained))
 
-    def regime_table(
-        self, trained: Sequence[Sequence[int]] | None = None, labels: Sequence[str] | None = None
-    ) -> RegimeTable:
+    def regime_table(self, trained: Trained | None = None, labels: Sequence[str] | None = None) -> RegimeTable:
         """The run as the lifelong metrics see it: a regime per training block and per evaluation at its boundaries.
 
         An experience is a training interval with finished episodes. Evaluations during blocks and of held-out tasks
@@ -412,7 +410,7 @@ class RunLog:
             for m in at_end.get(block, ()):
                 yield m["task"], False, [m["return_mean"]]
 
-    def _trained(self, trained: Sequence[Sequence[int]] | None) -> tuple[tuple[int, ...], ...]:
+    def _trained(self, trained: Trained | None) -> tuple[tuple[int, ...], ...]:
         if trained is None:
             trained = self._said()
             require((bool(trained), "this log does not say what each block trained: give trained, Curriculum.trained"))

@@ -31,8 +31,11 @@ ORDER = ("matrix", "curves", "optimum", "ceilings", "lifetime", "transfer")
 for _found in iter_modules(__path__):
     import_module(f"{__name__}.{_found.name}")
 
+NamedMetrics = dict[str, Metric]
+"""Metrics by name."""
 
-def of_inputs(given: Mapping[str, Any]) -> dict[str, Metric]:
+
+def of_inputs(given: Mapping[str, Any]) -> NamedMetrics:
     """Compute every metric whose inputs are given, by name.
 
     Args:
@@ -48,7 +51,7 @@ def of_inputs(given: Mapping[str, Any]) -> dict[str, Metric]:
     return {entry.metric.__name__: entry.of(given) for entry in listed if given.keys() >= {*entry.required}}
 
 
-def summary(performance: Tensor, trained: Trained) -> dict[str, Metric]:
+def summary(performance: Tensor, trained: Trained) -> NamedMetrics:
     """Compute the metrics that every run shows; what a definition does not cover is undefined with the reason.
 
     Args:
@@ -61,17 +64,17 @@ def summary(performance: Tensor, trained: Trained) -> dict[str, Metric]:
     return {metric.__name__: metric(performance, trained) for metric in SUMMARY}
 
 
-def of_matrix(performance: Tensor, trained: Trained) -> dict[str, Metric]:
+def of_matrix(performance: Tensor, trained: Trained) -> NamedMetrics:
     """Compute all metrics that need only the performance matrix, those of `summary` first; arguments as there."""
     return of_inputs({"performance": performance, "trained": trained})
 
 
-def of_curves(curves: Curves) -> dict[str, Metric]:
+def of_curves(curves: Curves) -> NamedMetrics:
     """Compute all metrics of evaluation curves that need no expert."""
     return of_inputs({"curves": curves})
 
 
-def of_regimes(regimes: Sequence[Regime], experts: Mapping[str, Sequence[Tensor]] | None = None) -> dict[str, Metric]:
+def of_regimes(regimes: Sequence[Regime], experts: Mapping[str, Sequence[Tensor]] | None = None) -> NamedMetrics:
     """Compute the lifelong metrics of regimes; `prepare` them first to get the numbers of l2metrics' defaults.
 
     Args:
@@ -101,7 +104,30 @@ def __dir__() -> list[str]:
     return sorted([*__all__, *METRICS])
 
 
-__all__ = ["AGAINST_EXPERTS", "MASTERED", "METRICS", "STAGES", "SUMMARY"]
-__all__ += ["Column", "Curves", "Definition", "Metric", "Regime", "RegimeTable", "Trained", "Undefined"]
-__all__ += ["definitions", "of_curves", "of_inputs", "of_matrix", "of_regimes", "prepare", "summary", "undefined"]
-__all__ += ["check_experts", "mean_area", "stage_areas", "trapezoid_area"]
+__all__ = [
+    "AGAINST_EXPERTS",
+    "MASTERED",
+    "METRICS",
+    "STAGES",
+    "SUMMARY",
+    "Column",
+    "Curves",
+    "Definition",
+    "Metric",
+    "Regime",
+    "RegimeTable",
+    "Trained",
+    "Undefined",
+    "check_experts",
+    "definitions",
+    "mean_area",
+    "of_curves",
+    "of_inputs",
+    "of_matrix",
+    "of_regimes",
+    "prepare",
+    "stage_areas",
+    "summary",
+    "trapezoid_area",
+    "undefined",
+]

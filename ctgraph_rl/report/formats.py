@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ctgraph_rl.log.escape import markdown_table, markdown_text, terminal_text
 from ctgraph_rl.parsers import TABLE_FORMATS
-from ctgraph_rl.report.latex import PREAMBLE, Labels, Table, TableCell
+from ctgraph_rl.report.latex import PREAMBLE, Labels, Table, TableCell, TableRows
 from ctgraph_rl.report.latex import latex as latex_table
 from ctgraph_rl.runs.read import split_by
 
@@ -142,7 +142,7 @@ class Matrix(NamedTuple):
 
     curriculum: str
     head: Sequence[str]
-    rows: Sequence[tuple[str, Sequence[TableCell]]]
+    rows: TableRows
     notes: Sequence[str]
 
 

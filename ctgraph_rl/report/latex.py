@@ -43,14 +43,18 @@ class TableCell(NamedTuple):
     note: int = 0
 
 
+TableRows = Sequence[tuple[str, Sequence[TableCell]]]
+"""Rows with their names."""
+
+
 class Table(NamedTuple):
-    """A table: the heading of the first column, those of the others, rows with their names, and notes."""
+    """A table: the heading of the first column, those of the others, rows, and notes."""
 
     caption: str
     label: str
     first: str
     head: Sequence[str]
-    rows: Sequence[tuple[str, Sequence[TableCell]]]
+    rows: TableRows
     notes: Sequence[str] = ()
 
 
@@ -72,9 +76,7 @@ def _columns(table: Table) -> int:
     return max(2, int(room // (COLUMN + COLUMN_SEPARATION)))
 
 
-def _float(
-    table: Table, rows: Sequence[tuple[str, Sequence[TableCell]]], parts: Sequence[tuple[int, int]], number: int
-) -> str:
+def _float(table: Table, rows: TableRows, parts: Sequence[tuple[int, int]], number: int) -> str:
     """Return one table with its parts."""
     again = f" (part {number})" if number > 1 else ""
     label = f"{table.label}-{number}" if number > 1 else table.label
@@ -92,7 +94,7 @@ def _float(
     return "\n".join([*head, "\n\\par\\medskip\n".join(bodies), *notes, r"\end{table}"])
 
 
-def _tabular(table: Table, rows: Sequence[tuple[str, Sequence[TableCell]]], part: tuple[int, int]) -> str:
+def _tabular(table: Table, rows: TableRows, part: tuple[int, int]) -> str:
     """Return some columns of a table, scaled down where they are wider than a line."""
     start, end = part
     heads = [latex_text(table.first), *map(_heading, table.head[start:end])]

@@ -84,15 +84,24 @@ def colour(number: int) -> str:
 
 def mark(kind: StateType, size: float) -> NamedValues:
     """Return the style of a state for matplotlib; sizes in points."""
-    edge = {"markeredgecolor": "0", "markeredgewidth": min(0.8, size / 10)}
-    size *= 0.85 if kind == StateType.DECISION else 1  # a square on its corner is wide
-    return {"marker": MARKERS[kind], "markersize": size, "markerfacecolor": colour(kind), "linestyle": "none"} | edge
+    shown = 0.85 * size if kind == StateType.DECISION else size  # a square on its corner is wide
+    return _mark(MARKERS[kind], shown, colour(kind), edge_width=min(0.8, size / 10))
 
 
 def goal_mark(size: float) -> NamedValues:
     """Return the style of a goal, the star of `ctgraph_rl.batch.render`."""
-    edge = {"markeredgecolor": "0", "markeredgewidth": 0.8}
-    return {"marker": "*", "markersize": size, "markerfacecolor": colour(GOAL), "linestyle": "none"} | edge
+    return _mark("*", size, colour(GOAL), edge_width=0.8)
+
+
+def _mark(marker: str, size: float, face: str, edge_width: float) -> NamedValues:
+    return {
+        "marker": marker,
+        "markersize": size,
+        "markerfacecolor": face,
+        "linestyle": "none",
+        "markeredgecolor": "0",
+        "markeredgewidth": edge_width,
+    }
 
 
 def draw_lines(axes: Any, lines: Sequence[Sequence[PlanePoint]], **style: Any) -> None:

@@ -14,5 +14,18 @@ from ctgraph_rl.tasks.images.reference_images import ReferenceImages, ReferenceO
 IMAGE_SETS = (PaperImages, GroupedImages, OneHot, ImageFile, ReferenceImages, ReferenceOneHot)
 """Every image set of this package; JSON names them by their classes."""
 
-__all__ = ["GroupedImages", "ImageFile", "OneHot", "PaperImages", "ReferenceImages", "ReferenceOneHot"]
-__all__ += ["IMAGE_SETS", "Distances", "ImageSet", "count_repeats", "distances", "has_cue_element", "white_level"]
+__all__ = [
+    "IMAGE_SETS",
+    "Distances",
+    "GroupedImages",
+    "ImageFile",
+    "ImageSet",
+    "OneHot",
+    "PaperImages",
+    "ReferenceImages",
+    "ReferenceOneHot",
+    "count_repeats",
+    "distances",
+    "has_cue_element",
+    "white_level",
+]
