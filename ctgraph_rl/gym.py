@@ -33,6 +33,7 @@ from ctgraph_rl.tasks.task import Task
 
 Frame = NDArray[np.uint8] | str
 NumpyArray = NDArray[Any]
+RowMask = NDArray[np.bool_]
 
 _RENDERING: NamedValues = {"render_modes": ["rgb_array", "ansi"], "render_fps": 2}
 
@@ -259,7 +260,7 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         observation = with_id(shown.observation.numpy(), self._ids, self._numbers)
         return observation, rewards, done.copy(), np.zeros_like(done), infos
 
-    def _restart(self, done: NDArray[np.bool_], final: Shown) -> tuple[Shown, NamedValues]:
+    def _restart(self, done: RowMask, final: Shown) -> tuple[Shown, NamedValues]:
         """Start an episode in rows that are done; what is shown then, and the infos with what was shown last."""
         last = np.full(self.num_envs, None, dtype=object)
         for i, observation in zip(done.nonzero()[0], final.observation.numpy()[done], strict=True):
@@ -270,7 +271,7 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         shown = self.rows.reset(final.done)
         return shown, infos | self._infos(shown)
 
-    def _infos(self, shown: Shown, mask: NDArray[np.bool_] | None = None) -> NamedValues:
+    def _infos(self, shown: Shown, mask: RowMask | None = None) -> NamedValues:
         """Return what `CTGraphGymEnv` gives in ``info``, for the rows of a mask or for all, as Gymnasium batches it."""
         values = {"task": self._numbers, "outcome": shown.outcome.numpy(), "leaf": shown.leaf.numpy()}
         infos: NamedValues = {}
@@ -293,7 +294,7 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
             raise ValueError(f"no episode is running in the rows {rows}: reset them first")
         return torch.from_numpy(action.astype(np.int64))
 
-    def _mask(self, options: NamedValues | None) -> NDArray[np.bool_]:
+    def _mask(self, options: NamedValues | None) -> RowMask:
         """The rows that a reset is for."""
         if options is None or "reset_mask" not in options:
             return np.ones(self.num_envs, np.bool_)
@@ -303,7 +304,7 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         require((fits and bool(mask.any()), rule), (self._is_seeded, "the first reset must be of all rows"))
         return mask.copy()
 
-    def _start_streams(self, mask: NDArray[np.bool_], seed: int | Sequence[int | None] | None) -> None:
+    def _start_streams(self, mask: RowMask, seed: int | Sequence[int | None] | None) -> None:
         """Start random streams in the rows of a mask that are given a seed, and in all at first."""
         seeds = self._spread_seed(seed)
         given = np.array([one is not None for one in seeds])
@@ -327,7 +328,7 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         require(*map(_seed_rule, seeds))
         return seeds
 
-    def _change_tasks(self, mask: NDArray[np.bool_]) -> None:
+    def _change_tasks(self, mask: RowMask) -> None:
         """Give the rows of a mask their next tasks."""
         if self._next_numbers is self._numbers:
             return
@@ -339,7 +340,7 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         if (self._numbers == self._next_numbers).all():
             self._next_numbers = self._numbers
 
-    def _only(self, mask: NDArray[np.bool_], change: Callable[[], None]) -> None:
+    def _only(self, mask: RowMask, change: Callable[[], None]) -> None:
         """A change that ends all episodes, in the rows of a mask only."""
         before = self.rows.state
         change()

@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from ctgraph_rl.checks import are_ints, as_tuple, at_least_one, is_int, require, takes_its_kinds
+from ctgraph_rl.checks import are_ints, as_tuple, at_least_one, is_int, one_of, require, takes_its_kinds
 from ctgraph_rl.core.rewards import Gradient, Needle, RewardFn
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import OneHot
@@ -108,10 +108,10 @@ def from_axes(
         ValueError: for values out of range; lists the choices.
     """
     require(
-        (order in ORDERS, f"order must be one of {', '.join(ORDERS)}, got {order!r}"),
+        *one_of(ORDERS, order=order),
         *at_least_one(num_goals=num_goals, repeats=repeats),
         (is_int(seed, 0), f"seed must be an integer >= 0, got {seed!r}"),
-        (reward_fn in REWARD_FNS, f"reward_fn must be one of {', '.join(REWARD_FNS)}, got {reward_fn!r}"),
+        *one_of(tuple(REWARD_FNS), reward_fn=reward_fn),
         (
             not one_hot or (image_seeds, image_size) == (1, IMAGE_SIZE),
             "one_hot has no image_seeds and no image_size: leave them out",

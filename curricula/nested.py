@@ -14,7 +14,7 @@ Single agents had 51,200 frames a task in the launchers, where the scripts' defa
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from itertools import chain, product
 
 from ctgraph_rl.checks import by_name, require
@@ -36,8 +36,8 @@ FOURTH_SKIPS_D5 = ["11", "110", "1101", "110111", "1101110", "11011100", "110111
 SEED_SETS = {1: (1, 2, 3, 4), 2: (3, 4, 5, 6), 3: (5, 6, 7, 8), 4: (7, 8, 9, 10), 5: (9, 10, 11, 12)}
 """The image seeds of the four families in each set of files."""
 
-Named = tuple[int, str]
-"""A task as (family, path)."""
+NamedTasks = list[tuple[int, str]]
+"""Tasks, each as (family, path)."""
 
 
 def ct28(num_frames: int = 51_200) -> Curriculum:
@@ -197,28 +197,28 @@ def _two_families(name: str, source: str, deepest: int, num_frames: int, agent: 
     return labelled(name, source, tasks, ids, num_ids, num_frames=num_frames, evaluation=Evaluation())
 
 
-def _family(number: int, deepest: int = 8) -> list[Named]:
+def _family(number: int, deepest: int = 8) -> NamedTasks:
     return [(number, PATHS[number][:depth]) for depth in range(2, deepest + 1)]
 
 
-def _families(*numbers: int, deepest: int = 8) -> list[list[Named]]:
+def _families(*numbers: int, deepest: int = 8) -> list[NamedTasks]:
     return [_family(number, deepest) for number in numbers]
 
 
-def _inconsistent() -> list[list[Named]]:
+def _inconsistent() -> list[NamedTasks]:
     fourth = [(4, path) for path in FOURTH_SKIPS_D5]
     return [*_families(1, 2, 3), fourth]
 
 
-def _one_by_one(families: list[list[Named]]) -> list[Named]:
+def _one_by_one(families: list[NamedTasks]) -> NamedTasks:
     return list(chain.from_iterable(families))
 
 
-def _turns(families: list[list[Named]]) -> list[Named]:
+def _turns(families: list[NamedTasks]) -> NamedTasks:
     return list(chain.from_iterable(zip(*families, strict=True)))
 
 
-def _of_agent(tasks: list[Named], agent: int | None) -> list[Named]:
+def _of_agent(tasks: NamedTasks, agent: int | None) -> NamedTasks:
     return tasks if agent is None else [chosen("agent", agent, tasks)]
 
 
@@ -229,7 +229,7 @@ def _pool(families: Iterable[int], deepest: int) -> GoalPool:
 def _curriculum(
     name: str,
     source: str,
-    named: Sequence[Named],
+    named: NamedTasks,
     num_frames: int,
     seed_set: int = 1,
     evaluation: Evaluation = MASK_EVALUATION,

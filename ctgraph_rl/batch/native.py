@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ctgraph_rl.batch.params import Tables
 from ctgraph_rl.checks import NamedValues, Rule, one_of, require
-from ctgraph_rl.core.dynamics import STATE_DTYPES, RowState, Shown
+from ctgraph_rl.core.dynamics import STATE_DTYPES, RowState, Shown, StateAndShown
 from ctgraph_rl.core.kernel import library, num_threads
 from ctgraph_rl.core.rewards import KERNEL_REWARDS, RewardFn
 from ctgraph_rl.core.row_params import RowParams
@@ -85,11 +85,11 @@ class Native:
         """Copies start without what is prepared."""
         return {"params": self.params, "tables": self.tables, "_call": None, "_state": None, "_shapes": None}
 
-    def reset(self, state: RowState, mask: Tensor) -> tuple[RowState, Shown]:
+    def reset(self, state: RowState, mask: Tensor) -> StateAndShown:
         """See `Rows.reset`."""
         return self._show(state, mask=mask)
 
-    def step(self, state: RowState, action: Tensor) -> tuple[RowState, Shown]:
+    def step(self, state: RowState, action: Tensor) -> StateAndShown:
         """See `Rows.step`."""
         return self._show(state, action=action)
 
@@ -98,7 +98,7 @@ class Native:
         state, shown = self._show(state, action=action)
         return state, (shown.observation, shown.done)
 
-    def step_or_reset(self, state: RowState, action: Tensor, mask: Tensor) -> tuple[RowState, Shown]:
+    def step_or_reset(self, state: RowState, action: Tensor, mask: Tensor) -> StateAndShown:
         """See `Rows.step_or_reset`."""
         return self._show(state, action=action, mask=mask)
 
@@ -141,7 +141,7 @@ class Native:
             shapes.append(one.expand(len(self.tables.entry), *pixels))
         return Stepped(*shapes)
 
-    def _show(self, state: RowState, **arrays: Any) -> tuple[RowState, Shown]:
+    def _show(self, state: RowState, **arrays: Any) -> StateAndShown:
         """One call for all that rows show, with the arrays ``action``, ``mask`` and ``shown``."""
         n = len(self.tables.entry)
         device = self.params.row.device

@@ -7,7 +7,7 @@ from torch import Tensor
 from ctgraph_rl.batch.draw_ahead import DrawsAhead
 from ctgraph_rl.batch.params import Tables
 from ctgraph_rl.core import dynamics
-from ctgraph_rl.core.dynamics import RowState, Shown
+from ctgraph_rl.core.dynamics import RowState, StateAndShown
 from ctgraph_rl.core.row_params import RowParams, Uses
 from ctgraph_rl.core.tree import is_done
 
@@ -30,14 +30,14 @@ class TensorEngine:
         self.params = params
         self.uses = tables.uses
 
-    def reset(self, state: RowState, mask: Tensor) -> tuple[RowState, Shown]:
+    def reset(self, state: RowState, mask: Tensor) -> StateAndShown:
         """See `Rows.reset`."""
         words = self._draws.then(state.tick, mask)
         state, shown = dynamics.reset(state, mask, self.params, self.uses, words)
         self._draws.move(state.tick, words)
         return state, shown
 
-    def step(self, state: RowState, action: Tensor) -> tuple[RowState, Shown]:
+    def step(self, state: RowState, action: Tensor) -> StateAndShown:
         """See `Rows.step`."""
         now = self._draws.now(state.tick)
         then = self._draws.then(state.tick, 1)
@@ -54,7 +54,7 @@ class TensorEngine:
         self._draws.move(state.tick, then)
         return state, (observation, is_done(state, self.params.tree))
 
-    def step_or_reset(self, state: RowState, action: Tensor, mask: Tensor) -> tuple[RowState, Shown]:
+    def step_or_reset(self, state: RowState, action: Tensor, mask: Tensor) -> StateAndShown:
         """See `Rows.step_or_reset`."""
         now = self._draws.now(state.tick)
         then = self._draws.then(state.tick, 1)

@@ -63,6 +63,9 @@ class Shown(NamedTuple):
     done: Tensor  # bool
 
 
+StateAndShown = tuple[RowState, Shown]
+"""The next states, and what they show."""
+
 Batch = TypeVar("Batch", RowState, Shown)
 
 
@@ -101,7 +104,7 @@ def words_of(tick: Tensor, params: RowParams, uses: Uses) -> Words:
 
 def step(
     state: RowState, action: Tensor, params: RowParams, uses: Uses, words: tuple[Words, Words] | None = None
-) -> tuple[RowState, Shown]:
+) -> StateAndShown:
     """Take a step in every row: a pure function, under ``torch.vmap`` and ``torch.compile`` too.
 
     Args:
@@ -147,7 +150,7 @@ def step_or_reset(
     params: RowParams,
     uses: Uses,
     words: tuple[Words, Words] | None = None,
-) -> tuple[RowState, Shown]:
+) -> StateAndShown:
     """Start an episode in the rows of a mask, whatever their action, and step the others; else as `step`."""
     now, then = words or (words_of(tick, params, uses) for tick in (state.tick, state.tick + 1))
     stepped = advance(state, action, now, params, uses)
@@ -278,9 +281,7 @@ def _share(after: State, goal_leaf: Tensor, params: RowParams, uses: Uses) -> Te
 # Episode
 
 
-def reset(
-    state: RowState, mask: Tensor, params: RowParams, uses: Uses, words: Words | None = None
-) -> tuple[RowState, Shown]:
+def reset(state: RowState, mask: Tensor, params: RowParams, uses: Uses, words: Words | None = None) -> StateAndShown:
     """Start an episode in the rows of a mask; a pure function like `step`.
 
     Args:

@@ -14,6 +14,9 @@ from torch import Tensor
 Tensors = Mapping[Any, Tensor]
 """Tensors by key."""
 
+OwnTensors = dict[Any, Tensor]
+"""Tensors by key, in memory of a region."""
+
 WARM_UP = 3
 """Calls before a function is captured: libraries and kernels are loaded, and optimisers make their state."""
 
@@ -35,14 +38,14 @@ class Region:
             of its results. Tensors of others that it writes to, such as weights, must stay in place.
     """
 
-    def __init__(self, function: Callable[[dict[Any, Tensor]], Tensors]) -> None:
+    def __init__(self, function: Callable[[OwnTensors], Tensors]) -> None:
         self.function = function
         self.graph: torch.cuda.CUDAGraph | None = None
         self._calls = 0
-        self._arguments: dict[Any, Tensor] = {}
-        self._results: dict[Any, Tensor] = {}
+        self._arguments: OwnTensors = {}
+        self._results: OwnTensors = {}
 
-    def __call__(self, arguments: Tensors) -> dict[Any, Tensor]:
+    def __call__(self, arguments: Tensors) -> OwnTensors:
         """Return the function's results, which the next call overwrites.
 
         Args:
@@ -59,7 +62,7 @@ class Region:
             self.graph.replay()
         return dict(self._results)
 
-    def copies(self, arguments: Tensors) -> dict[Any, Tensor]:
+    def copies(self, arguments: Tensors) -> OwnTensors:
         """Return the function's results, all of one shape, as copies."""
         found = self(arguments)
         return dict(zip(found, torch.stack(list(found.values())).unbind(), strict=True))
@@ -89,7 +92,7 @@ class Region:
         return graph
 
     @staticmethod
-    def _write(buffers: dict[Any, Tensor], values: Tensors) -> None:
+    def _write(buffers: OwnTensors, values: Tensors) -> None:
         """Write values into buffers, which the first call makes."""
         if not buffers:
             buffers.update({key: value.detach().clone() for key, value in values.items()})

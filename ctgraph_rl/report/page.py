@@ -49,6 +49,10 @@ MOST_COLUMNS = 10
 """Tasks up to which a performance matrix is a table in LaTeX."""
 
 
+TextRow = tuple[str, ...]
+"""The cells of a row of a table."""
+
+
 class Report(NamedTuple):
     """The page that was written, its runs, and what could not be read."""
 
@@ -61,8 +65,8 @@ class Numbers(NamedTuple):
     """A matrix as a table."""
 
     title: str
-    head: tuple[str, ...]
-    rows: list[tuple[str, ...]]
+    head: TextRow
+    rows: list[TextRow]
 
 
 class AgentPart(NamedTuple):
@@ -86,11 +90,11 @@ class Part(NamedTuple):
     everything: formats.Page | None  # the table of every measure
     agents: list[AgentPart]
     unshown: int  # agents without figures
-    runs: list[tuple[str, ...]]
+    runs: list[TextRow]
     systems: list[tuple[str, int]]  # where the runs ran, and how many
 
     @property
-    def by_agent(self) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    def by_agent(self) -> tuple[TextRow, list[TextRow]]:
         """The table of agents and measures as texts: its head and its rows."""
         lines = []
         for agent, cells in self.matrix.rows:
@@ -257,7 +261,7 @@ def _numbers(section: Section, result: Result) -> Iterator[Numbers]:
         yield Numbers(title, ("block", *section.labels), rows)
 
 
-def _runs(result: Result) -> Iterator[tuple[str, ...]]:
+def _runs(result: Result) -> Iterator[TextRow]:
     """Agent, seed, state, frames, minutes and directory of each run."""
     for seed, run in result.by_seed.items():
         if run is None:

@@ -35,6 +35,7 @@ from ctgraph_rl.checks import (
     did_you_mean,
     is_int,
     nearest,
+    one_of,
     positive,
     require,
 )
@@ -211,7 +212,7 @@ def check_values(cfg: DictConfig) -> None:
     require((in_sweep() or not cfg.together, f"together=true trains the seeds of a sweep as one batch: {seeds}"))
     require(
         check_overwrite(cfg.overwrite),
-        (cfg.resume in RESUME, f"resume must be one of {', '.join(RESUME)}, got {cfg.resume!r}"),
+        *one_of(RESUME, resume=cfg.resume),
         *positive(checkpoint_seconds=cfg.checkpoint_seconds),
     )
     if cfg.portable:

@@ -45,6 +45,12 @@ NO_METHOD = "Finetune"
 MOST_MODULES = 3
 """Modules that differ between runs that else are alike and are named; one digest stands for all others."""
 
+CurriculumKey = tuple[str, str]
+"""A curriculum by its name and its fingerprint."""
+
+AgentKey = tuple[str, str]
+"""An agent on a curriculum, by the names that tables show."""
+
 Curve = list[tuple[int, float]]
 """Mean returns after numbers of frames; NaN for one without a value."""
 
@@ -106,12 +112,12 @@ class Run:
     shown: tuple[int, str] | None = None
 
     @property
-    def curriculum(self) -> tuple[str, str]:
+    def curriculum(self) -> CurriculumKey:
         """The curriculum by its name and its fingerprint."""
         return self.about["curriculum"], self.about["fingerprint"]
 
     @property
-    def group(self) -> tuple[str, str]:
+    def group(self) -> CurriculumKey:
         """The curriculum by its published name and its fingerprint."""
         name, fingerprint = self.curriculum
         return name.removesuffix(MODIFIED), fingerprint
@@ -129,12 +135,12 @@ class Run:
         return found
 
     @property
-    def alike(self) -> tuple[tuple[str, str], str]:
+    def alike(self) -> tuple[CurriculumKey, str]:
         """Equal for runs that differ only in seed and code."""
         return self.group, json.dumps(self.settings, sort_keys=True)
 
     @property
-    def configuration(self) -> tuple[tuple[str, str], str, str]:
+    def configuration(self) -> tuple[CurriculumKey, str, str]:
         """Equal for runs that differ only in their seed."""
         return *self.alike, json.dumps(self.code, sort_keys=True)
 
@@ -338,17 +344,17 @@ def _history(log: RunLog) -> History:
     )
 
 
-def grouped(runs: Sequence[Run]) -> dict[tuple[str, str], dict[int, Run | None]]:
+def grouped(runs: Sequence[Run]) -> dict[AgentKey, dict[int, Run | None]]:
     """Runs by seed, for each (curriculum, agent), as `_in_order`; None for a seed that only other agents have."""
     groups: dict[tuple[Any, ...], dict[int, Run]] = {}
-    expected: dict[tuple[str, str], set[int]] = {}
+    expected: dict[CurriculumKey, set[int]] = {}
     for run in _in_order(runs):
         groups.setdefault(run.configuration, {})[run.seed] = run
         if run.agent is not None:
             expected.setdefault(run.group, set()).add(run.seed)
     one_each = [next(iter(by_seed.values())) for by_seed in groups.values()]
     curricula = _curriculum_names(runs)
-    found: dict[tuple[str, str], dict[int, Run | None]] = {}
+    found: dict[AgentKey, dict[int, Run | None]] = {}
     for one, agent, by_seed in zip(one_each, _agent_names(one_each), groups.values(), strict=True):
         seeds = sorted(by_seed if one.agent is None else expected[one.group])
         name = agent if one.shown is None else one.shown[1]
@@ -361,9 +367,9 @@ def _place(run: Run | None) -> float:
     return math.inf if run is None or run.shown is None else run.shown[0]
 
 
-def _curriculum_names(runs: Iterable[Run]) -> dict[tuple[str, str], str]:
+def _curriculum_names(runs: Iterable[Run]) -> dict[CurriculumKey, str]:
     """Each curriculum's shortest name, with its fingerprint where another one has the same name."""
-    named: dict[tuple[str, str], str] = {}
+    named: dict[CurriculumKey, str] = {}
     for run in runs:
         named[run.group] = min(named.get(run.group, run.curriculum[0]), run.curriculum[0], key=len)
     several = repeated(named.values())
@@ -413,7 +419,7 @@ def code_of(run: Run, others: Sequence[Run]) -> str:
     return ", ".join(said)
 
 
-def _kind(run: Run) -> tuple[tuple[str, str], str]:
+def _kind(run: Run) -> tuple[CurriculumKey, str]:
     """Return curriculum and name of the agent."""
     return run.group, _name(run)
 

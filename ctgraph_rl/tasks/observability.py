@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from ctgraph_rl.checks import Rule, require
+from ctgraph_rl.checks import Rule, one_of, require
 from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.core.rewards import Needle
 from ctgraph_rl.tasks.task import Task
@@ -61,7 +61,7 @@ def state_entropy(task: Task, policy: str = "random") -> float:
     Raises:
         ValueError: for an unknown policy, and a ``legacy_index`` with more than two branches.
     """
-    require(_policy_rule(policy), _index_rule(task))
+    require(*one_of(POLICIES, policy=policy), _index_rule(task))
     visits = _visits(task.graph, *_chances(task.graph, policy))
     branches = _branches(task.graph, policy)
     open_bits = 0.0
@@ -100,7 +100,7 @@ def transition_entropy(task: Task, policy: str = "navigation", informed: bool = 
     drawn = task.reward_std or task.goal_change or x.read_noise or x.read_rotation or x.reward_cue
     fixed = task.reward_fn == Needle() and not drawn and not task.extra_end_step
     require(
-        _policy_rule(policy),
+        *one_of(POLICIES, policy=policy),
         _index_rule(task),
         (fixed, "the entropy of transitions is exact for a Needle reward, with no noise, change or extra step"),
     )
@@ -185,10 +185,6 @@ def _bits(by_level: dict[int, float], branches: int) -> float:
     """-sum_s v(s) log2(v(s) / v) for levels whose ``branches``^level states are visited equally often."""
     total = sum(by_level.values())
     return sum(v * (level * math.log2(branches) - math.log2(v / total)) for level, v in by_level.items() if v > 0)
-
-
-def _policy_rule(policy: str) -> Rule:
-    return policy in POLICIES, f"policy must be one of {', '.join(POLICIES)}, got {policy!r}"
 
 
 def _index_rule(task: Task) -> Rule:

@@ -37,8 +37,12 @@ MAX_COMPARED_BYTES = 2**31
 CHOOSING = (StateType.WAIT, StateType.DECISION)
 """The states whose actions matter: home leads on whatever the action."""
 
-ON_THE_WAY, ELSEWHERE = 0, 1
+ON_THE_WAY = 0
+ELSEWHERE = 1
 """The two kinds of nodes of a tree that collapses."""
+
+ActionSets = dict[tuple[StateType, int], list[int]]
+"""Sets of actions by kind and level, each an integer with a bit for each action."""
 
 
 def shared_decisions(tasks: Sequence[Task]) -> Tensor:
@@ -178,7 +182,7 @@ class _Choices:
     """
 
     task: Task
-    sets: dict[tuple[StateType, int], list[int]]
+    sets: ActionSets
     collapsed: bool
 
     @cached_property
@@ -211,7 +215,7 @@ def _choices(tasks: tuple[Task, ...], gamma: float) -> list[_Choices]:
     return [_Choices(task, _optimal_sets(task, gamma, num_actions), is_needle(task)) for task in tasks]
 
 
-def _optimal_sets(task: Task, gamma: float, num_actions: int) -> dict[tuple[StateType, int], list[int]]:
+def _optimal_sets(task: Task, gamma: float, num_actions: int) -> ActionSets:
     """Backward induction from the end states, as `values` does it, that keeps what is optimal."""
     tree = smallest_tree(task, is_needle(task))
     best = BestActions(task, gamma)

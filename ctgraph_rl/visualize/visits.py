@@ -17,14 +17,15 @@ from ctgraph_rl.learn.evaluate import evaluate
 from ctgraph_rl.policies import RandomPolicy
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.visualize.states import Key
 
 
 class Visits(NamedTuple):
     """Counts over a number of episodes, by (state type, node); home and fail have node 0."""
 
-    counts: dict[tuple[StateType, int], int]
+    counts: dict[Key, int]
     """Steps that began in a home, wait or decision state, and episodes that ended in an end state or in fail."""
-    actions: dict[tuple[StateType, int], list[float]]
+    actions: dict[Key, list[float]]
     """The share of each action in home, wait and decision states; those above b are of other tasks, and fail."""
 
 
@@ -83,8 +84,8 @@ def _count(task: Task, steps: Tensor, ends: TensorDictBase) -> Visits:
     first = task.graph.num_decision_states
     leaves = ends["leaf"].flatten().tolist()
     num_actions = max(task.graph.branching_factor, int(steps[:, 2].max())) + 1
-    counts: Counter[tuple[StateType, int]] = Counter()
-    actions: dict[tuple[StateType, int], list[float]] = {}
+    counts: Counter[Key] = Counter()
+    actions: dict[Key, list[float]] = {}
     for (kind, node, action), times in Counter(map(tuple, steps.tolist())).items():
         key = StateType(kind), node
         counts[key] += times
