@@ -9,7 +9,7 @@ import os
 import re
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import fields
 from difflib import get_close_matches
 from functools import wraps
@@ -338,7 +338,7 @@ def not_negative(**values: object) -> list[Rule]:
     return _rules(lambda value: is_real(value, 0), "a number >= 0", values)
 
 
-def one_of(choices: tuple[str, ...], **values: object) -> list[Rule]:
+def one_of(choices: Collection[str], **values: object) -> list[Rule]:
     """Rules that each named value is one of the choices."""
     return _rules(lambda value: isinstance(value, str) and value in choices, f"one of {', '.join(choices)}", values)
 

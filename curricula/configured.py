@@ -111,7 +111,7 @@ def from_axes(
         *one_of(ORDERS, order=order),
         *at_least_one(num_goals=num_goals, repeats=repeats),
         (is_int(seed, 0), f"seed must be an integer >= 0, got {seed!r}"),
-        *one_of(tuple(REWARD_FNS), reward_fn=reward_fn),
+        *one_of(REWARD_FNS, reward_fn=reward_fn),
         (
             not one_hot or (image_seeds, image_size) == (1, IMAGE_SIZE),
             "one_hot has no image_seeds and no image_size: leave them out",

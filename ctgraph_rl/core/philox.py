@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ctgraph_rl.core import kernel
 
-Words = tuple[Tensor, ...]
+PhiloxWords = tuple[Tensor, ...]
 """Words of 32 bits, each an int64 tensor with values in [0, 2**32)."""
 
 _WORD = 0xFFFFFFFF
@@ -27,7 +27,7 @@ the task, and what agents draw."""
 _STREAM_SHIFT = 28  # 16 streams of 2**28 blocks each
 
 
-def philox(counter: Words, key: Words) -> Words:
+def philox(counter: PhiloxWords, key: PhiloxWords) -> PhiloxWords:
     """Philox4x32-10: four random words for a counter of four words and a key of two.
 
     Args:
@@ -41,7 +41,7 @@ def philox(counter: Words, key: Words) -> Words:
     return kernel.philox(words) if kernel.takes(*words) else by_tensors(counter, key)
 
 
-def by_tensors(counter: Words, key: Words) -> Words:
+def by_tensors(counter: PhiloxWords, key: PhiloxWords) -> PhiloxWords:
     """`philox` where there is no C code."""
     c0, c1, c2, c3 = counter
     k0, k1 = key
@@ -70,7 +70,7 @@ def _product(a: Tensor, b: Tensor | int) -> tuple[Tensor, Tensor]:
     return half >> 31, ((half & 0x7FFFFFFF) << 1) | (rest & 1)
 
 
-def draw(seed: Tensor, row: Tensor, tick: Tensor, stream: int, block: Tensor | int = 0) -> Words:
+def draw(seed: Tensor, row: Tensor, tick: Tensor, stream: int, block: Tensor | int = 0) -> PhiloxWords:
     """Four random words per element for (seed, row, tick, stream, block).
 
     Args:
