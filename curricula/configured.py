@@ -147,10 +147,8 @@ def from_axes(
     else:
         drawn = f"random_graphs draws goals and order: leave both out, got goals={goals!r} and order={order!r}"
         require(((goals, order) == ("all", "product"), drawn))
-        shapes = _choices(configuration, branching_factor=branching_factor, depth=depth, wait_prob=wait_prob)
-        kinds = (KINDS[configuration],)
-        drawn_tasks = axes.random_tasks(random_graphs, seed, **shapes, kinds=kinds, image_seeds=seeds)
-        tasks = tuple(map(observed, drawn_tasks))
+        shape = (branching_factor, depth, wait_prob)
+        tasks = tuple(map(observed, _drawn(configuration, shape, random_graphs, seed, image_seeds=seeds)))
     tasks = tuple(map(rewarded, tasks))
     if one_hot:
         tasks = axes.image_sets(tasks, [OneHot(tasks[0].images.num_images)])
@@ -159,10 +157,21 @@ def from_axes(
     return axes.sequence(name, [tasks] if changes else tasks, num_frames, switch=changes)
 
 
-def _choices(configuration: str, **given: Any) -> dict[str, tuple[Any, ...]]:
-    """The choices of each argument of `axes.random_tasks` for a graph; None: as configured."""
+def _drawn(
+    configuration: str, shape: tuple[Any, Any, Any], count: int, seed: int, image_seeds: tuple[int, ...]
+) -> Tasks:
+    """Random tasks with some branching factors, depths and wait probabilities; None: as configured."""
     graph = configured(configuration).graph
-    return {f"{name}s": _several(getattr(graph, name) if value is None else value) for name, value in given.items()}
+    branching_factor, depth, wait_prob = shape
+    return axes.random_tasks(
+        count,
+        seed,
+        branching_factors=_several(branching_factor, graph.branching_factor),
+        depths=_several(depth, graph.depth),
+        wait_probs=_several(wait_prob, graph.wait_prob),
+        kinds=(KINDS[configuration],),
+        image_seeds=image_seeds,
+    )
 
 
 def _deepest(
@@ -170,7 +179,7 @@ def _deepest(
 ) -> tuple[Task, tuple[Any, ...]]:
     """The configured task on its deepest graph, and all depths."""
     task = configured(configuration)
-    depths = _several(task.graph.depth if depth is None else depth)
+    depths = _several(depth, task.graph.depth)
     whole = bool(depths) and are_ints(depths, 1)
     require((whole, f"depth must be an integer >= 1 or a list of them, got {depth!r}"))
     b = task.graph.branching_factor if branching_factor is None else branching_factor
@@ -196,7 +205,7 @@ def _by_seed(
     task: Task, depths: tuple[int, ...], wait_prob: Any, seeds: tuple[int, ...], with_goals: Callable[[Task], Tasks]
 ) -> list[list[Tasks]]:
     """For each image seed the tasks on each graph."""
-    probs = _several(task.graph.wait_prob if wait_prob is None else wait_prob)
+    probs = _several(wait_prob, task.graph.wait_prob)
     found = []
     for shown in axes.image_seeds(task, seeds):
         graphs = axes.growing_depth(axes.wait_probs(shown, probs), depths)
@@ -246,6 +255,7 @@ def _switch(switch: str | None, episodes: int) -> Switch | None:
     return None if switch is None else SWITCHES[switch](episodes)
 
 
-def _several(value: object) -> tuple[Any, ...]:
-    listed = as_tuple(value)
-    return listed if isinstance(listed, tuple) else (value,)
+def _several(value: object, usual: object = None) -> tuple[Any, ...]:
+    """A value or several of them as a tuple; the usual one for None."""
+    listed = as_tuple(usual if value is None else value)
+    return listed if isinstance(listed, tuple) else (listed,)
