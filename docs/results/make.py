@@ -70,9 +70,10 @@ def _parser() -> argparse.ArgumentParser:
 
     _add_tables(commands)
 
-    submitting = commands.add_parser("submit", help="make submissions to the board from runs of the track small")
+    submitting = commands.add_parser("submit", help="make submissions to the board from runs of a track")
     submitting.add_argument("runs", type=Path, help="folder with run directories")
     submitting.add_argument("commit", help="of the code that ran them")
+    submitting.add_argument("--track", default="small", help="that the runs are of")
     submitting.add_argument("--given", default="", help="ends the names of submissions, such as -at_boundaries")
     submitting.set_defaults(run=_submit)
 
@@ -129,7 +130,7 @@ def _collect(options: argparse.Namespace) -> None:
 
 def _submit(options: argparse.Namespace) -> None:
     """Submit the runs of a folder."""
-    _module("studies.board").submit_all(options.runs, options.commit, options.given)
+    _module("studies.board").submit_all(options.runs, options.commit, options.given, options.track)
 
 
 if __name__ == "__main__":

@@ -13,14 +13,21 @@ from ctgraph_rl.board.standings.board_formats import columns
 from ctgraph_rl.board.standings.board_page import write_board
 from ctgraph_rl.board.standings.board_tables import BoardTable
 from ctgraph_rl.board.standings.entries import shown_level
+from ctgraph_rl.board.standings.track_ceilings import Ceilings
 from studies.raw import HERE, TEMPLATES, table
 
 FOLDER = HERE / "board"
 PUBLISHED = date(2026, 11, 23)
-TRACK = "small"
+SMALL = "small"
 
 WEIGHTS = 4 * 13956
-"""Bytes of the weights of PPO's network, float32."""
+"""Bytes of the weights of PPO's network on the small track, float32."""
+
+WEIGHTS_CT8 = 4 * 14212
+"""Bytes of those on CT8, whose ids are longer."""
+
+WEIGHTS_NO_ID = 4 * 13700
+"""Bytes of those where observations have no id."""
 
 HEAD = 1040
 """Bytes of the weights of its output layers."""
@@ -34,15 +41,30 @@ EMBEDDING = 29600
 ARXIV = "https://arxiv.org/abs/"
 
 
+ALONE = ("method", "score", "bytes per task", "hours")
+"""Columns of the table of lines that are alone in theirs."""
+
+TUNING = "the settings of the package; strengths of methods were chosen for PPO, on seeds that were not recorded"
+
+OF_CONF = "the settings of the package; on which seeds they were chosen was not recorded"
+
+SEARCH = "experiment=memory_search: batches, learning rate and entropy bonus, at depth 2 with 100 steps"
+
+ONE_SEED = "64 environments in place of 256, whose run learned less and was stopped; else as in the package"
+
+
 class About(NamedTuple):
-    """What a submission says of a method: its name, its paper, and the bytes that it keeps for each further task."""
+    """What a submission says of a method: its name and paper, the bytes for each further task, how it was tuned."""
 
     name: str
     paper: str | None
     bytes_per_task: int
+    tuning: str = TUNING
+    tuning_seeds: tuple[int, ...] = ()
+    tuning_hours: float | None = None
 
 
-METHODS = {
+ON_SMALL = {
     "ppo": About("PPO", ARXIV + "1707.06347", 0),
     "a2c": About("A2C", ARXIV + "1602.01783", 0),
     "reinforce": About("REINFORCE", "https://doi.org/10.1007/BF00992696", 0),
@@ -64,54 +86,106 @@ METHODS = {
 }
 """The beginning of the names of runs, and what is submitted of them."""
 
+METHODS = {
+    SMALL: ON_SMALL,
+    "adaptation": {"rl2": About("RL^2", ARXIV + "1611.02779", 0, OF_CONF)},
+    "exploration": {"ppo_count": ON_SMALL["ppo_count"]._replace(tuning=OF_CONF)},
+    "forgetting": {"ppo-mask_ri": ON_SMALL["ppo-mask_ri"]._replace(bytes_per_task=WEIGHTS_CT8, tuning=OF_CONF)},
+    "growing_depth": {
+        "ppo-mask_lc": ON_SMALL["ppo-mask_lc"]._replace(bytes_per_task=WEIGHTS_NO_ID + 32, tuning=OF_CONF)
+    },
+    "memory": {"lstm_ppo-gru": About("PPO with a GRU", ARXIV + "1406.1078", 0, SEARCH, (100, 101))},
+    "sharing": {
+        "ppo_count-mask_lc": About(
+            "PPO with a count-based bonus + Mask LC", ARXIV + "2212.11110", WEIGHTS_NO_ID + 32, ONE_SEED, (100,), 0.2
+        )
+    },
+}
+"""What is submitted to each track."""
+
 ELSEWHERE = ("average performance", "bytes of the agent", "steps", "n", "level")
 """Columns that only the board itself has: the page names seeds and levels once."""
 
-TUNING = "the settings of the package; strengths of methods were chosen for PPO, on seeds that were not recorded"
 
-
-def submit_all(runs: Path, commit: str, given: str) -> None:
-    """Submit every method of `METHODS` of which there are all runs in a folder; a submission is replaced."""
+def submit_all(runs: Path, commit: str, given: str, track_name: str = SMALL) -> None:
+    """Submit every method of a track of which there are all runs in a folder; a submission is replaced."""
     from ctgraph_rl.board.submit import submit
     from ctgraph_rl.board.tracks import track
 
-    of_track = track(TRACK)
+    of_track = track(track_name)
     names = [path.parent.name for path in sorted(runs.glob("*/metrics.json"))]
-    for start, about in METHODS.items():
+    prefix = "" if track_name == SMALL else f"{track_name}-"
+    for start, about in METHODS[track_name].items():
         folders = [runs / name for name in names if name.startswith(f"{start}-seed")]
         if len(folders) >= len(of_track.seeds):
-            folder = FOLDER / f"{start}{given}"
+            folder = FOLDER / f"{prefix}{start}{given}"
             shutil.rmtree(folder, ignore_errors=True)
-            print(submit(folders, folder, _method(about, commit), of_track).digest, folder.name)
+            print(submit(folders, folder, _method(about, commit, track_name), of_track).digest, folder.name)
 
 
-def _method(about: About, commit: str) -> dict[str, Any]:
+def _method(about: About, commit: str, track_name: str) -> dict[str, Any]:
     """Return what ``method.yaml`` says."""
     import yaml
 
     from ctgraph_rl.board.method_yaml import TEMPLATE
 
     method = yaml.safe_load(TEMPLATE)
-    method |= {"name": about.name, "track": TRACK, "authors": ["The ctgraph_rl developers"], "paper": about.paper}
+    method |= {"name": about.name, "track": track_name, "authors": ["The ctgraph_rl developers"], "paper": about.paper}
     method |= {"code": {"repository": OURS, "commit": commit, "licence": "Apache-2.0"}}
-    method["bytes_per_task"], method["tuning"]["how"] = about.bytes_per_task, TUNING
+    method["bytes_per_task"] = about.bytes_per_task
+    method["tuning"] = {"how": about.tuning, "seeds": list(about.tuning_seeds)}
+    method["compute"]["tuning_hours"] = about.tuning_hours
     return method
 
 
 def page(tables: list[BoardTable]) -> str:
     """Return the page: its template with its tables."""
-    shown = [part for each in tables for part in (f"## {each.title}", _table(each))]
+    several = [each for each in tables if len(each.standings) > 1]
+    alone = [each for each in tables if len(each.standings) == 1]
     lines = [line for each in tables for line in each.standings]
     levels = [shown_level(line.entry.level) for line in lines]
-    counts = ", ".join(f"{levels.count(level)} {level}" for level in dict.fromkeys(levels))
     template = Template((TEMPLATES / "board.md").read_text(encoding="utf-8"))
-    return template.substitute(tables="\n\n".join(shown), levels=counts, count=len(lines))
+    return template.substitute(
+        tables="\n\n".join(f"## {each.title}\n\n{_table(each)}" for each in several),
+        alone=table(["track and rung", "given", *ALONE, "landmarks"], list(map(_line, alone))),
+        levels=", ".join(f"{levels.count(level)} {level}" for level in dict.fromkeys(levels)),
+        count=len(lines),
+        without=_without({each.track.name for each in tables}),
+    )
+
+
+def _without(there: set[str]) -> str:
+    """Return a sentence about the tracks that have no line; nothing where each has one."""
+    from ctgraph_rl.board.tracks import tracks
+
+    lacking = [f"`{each.name}`" for each in tracks() if each.name not in there]
+    return f" No line yet: {', '.join(lacking)}." if lacking else ""
 
 
 def _table(of: BoardTable) -> str:
     lines = [[cell for cell in columns(line) if cell.head not in ELSEWHERE] for line in of.standings]
     rows = [[f"{cell.shown} {cell.interval}".strip() for cell in cells] for cells in lines]
     return table([cell.head for cell in lines[0]], rows)
+
+
+def _line(of: BoardTable) -> list[str]:
+    """Return the cells of a table's only line, beside what policies get that lack what the track is about."""
+    standing = of.standings[0]
+    cells = {cell.head: cell.shown for cell in columns(standing)}
+    learned = ", ".join(filter(None, (of.track.id, of.variant.rung)))
+    score, _, interval = str(standing.score).partition(" n = ")[0].partition(" ")
+    numbers = [cells["method"], f"{score} {interval}", cells["bytes per task"], cells["hours"]]
+    return [learned, of.variant.given, *numbers, _landmarks(of.ceilings)]
+
+
+def _landmarks(of: Ceilings) -> str:
+    """Return the returns of policies that lack what a track is about."""
+    parts = [f"random {of.random:.2g}"]
+    if of.memoryless is not None and of.memoryless < 1:
+        parts.append(f"no memory {of.memoryless:.2f}")
+    if of.search is not None:
+        parts.append(f"best search {of.search:.3f}")
+    return ", ".join(parts)
 
 
 def draw(of: BoardTable, path: Path) -> None:
