@@ -40,10 +40,6 @@ EMBEDDING = 29600
 
 ARXIV = "https://arxiv.org/abs/"
 
-
-ALONE = ("method", "score", "bytes per task", "hours")
-"""Columns of the table of lines that are alone in theirs."""
-
 TUNING = "the settings of the package; strengths of methods were chosen for PPO, on seeds that were not recorded"
 
 OF_CONF = "the settings of the package; on which seeds they were chosen was not recorded"
@@ -94,16 +90,21 @@ METHODS = {
     "growing_depth": {
         "ppo-mask_lc": ON_SMALL["ppo-mask_lc"]._replace(bytes_per_task=WEIGHTS_NO_ID + 32, tuning=OF_CONF)
     },
-    "memory": {"lstm_ppo-gru": About("PPO with a GRU", ARXIV + "1406.1078", 0, SEARCH, (100, 101))},
+    "memory": {"lstm_ppo-gru": About("PPO with a GRU", ARXIV + "1406.1078", 0, SEARCH, tuning_seeds=(100, 101))},
     "sharing": {
         "ppo_count-mask_lc": About(
-            "PPO with a count-based bonus + Mask LC", ARXIV + "2212.11110", WEIGHTS_NO_ID + 32, ONE_SEED, (100,), 0.2
+            "PPO with a count-based bonus + Mask LC",
+            ARXIV + "2212.11110",
+            WEIGHTS_NO_ID + 32,
+            tuning=ONE_SEED,
+            tuning_seeds=(100,),
+            tuning_hours=0.2,
         )
     },
 }
 """What is submitted to each track."""
 
-ELSEWHERE = ("average performance", "bytes of the agent", "steps", "n", "level")
+ELSEWHERE = ("average performance", "bytes of the agent", "steps", "n", "hours", "level")
 """Columns that only the board itself has: the page names seeds and levels once."""
 
 
@@ -147,7 +148,9 @@ def page(tables: list[BoardTable]) -> str:
     template = Template((TEMPLATES / "board.md").read_text(encoding="utf-8"))
     return template.substitute(
         tables="\n\n".join(f"## {each.title}\n\n{_table(each)}" for each in several),
-        alone=table(["track and rung", "given", *ALONE, "landmarks"], list(map(_line, alone))),
+        alone=table(
+            ["track and rung", "given", "method", "score", "bytes per task", "landmarks"], list(map(_line, alone))
+        ),
         levels=", ".join(f"{levels.count(level)} {level}" for level in dict.fromkeys(levels)),
         count=len(lines),
         without=_without({each.track.name for each in tables}),
@@ -174,8 +177,8 @@ def _line(of: BoardTable) -> list[str]:
     cells = {cell.head: cell.shown for cell in columns(standing)}
     learned = ", ".join(filter(None, (of.track.id, of.variant.rung)))
     score, _, interval = str(standing.score).partition(" n = ")[0].partition(" ")
-    numbers = [cells["method"], f"{score} {interval}", cells["bytes per task"], cells["hours"]]
-    return [learned, of.variant.given, *numbers, _landmarks(of.ceilings)]
+    about = [cells["method"], f"{score} {interval}", cells["bytes per task"]]
+    return [learned, of.variant.given, *about, _landmarks(of.ceilings)]
 
 
 def _landmarks(of: Ceilings) -> str:
