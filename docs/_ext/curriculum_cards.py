@@ -7,6 +7,7 @@ from functools import cache
 
 from bibliography import entries_of
 from results_of import curriculum_results
+from short_runs import sentence_of, study_of
 from yaml_settings import ALONE, CONF, escaped, settings_of, table
 
 import curricula
@@ -20,17 +21,20 @@ from ctgraph_rl.tasks.values import random_frames_to_goal
 MANY = 16
 """Tasks from which on the tables of a card are folded."""
 
+NO_RUN = "No run yet: `ctgraph-rl -m experiment=every_curriculum` has short ones."
+"""What a card says of a curriculum without results."""
 
-def curriculum_cards(figures: dict[str, tuple[str, str]]) -> Iterator[tuple[str, str]]:
+
+def curriculum_cards(figures: dict[str, dict[str, str]]) -> Iterator[tuple[str, str]]:
     """Yield the path and the text of each card, and of the list of them, in Markdown.
 
     Args:
-        figures: by name the files with the graphs and the similarity of each curriculum, in ``generated/figures``.
+        figures: by name and kind the files with the drawings of each curriculum, in ``generated/figures``.
     """
     all_curricula = {name: curricula.load(name) for name in curricula.names()}
     yield "curricula/index.md", _index(all_curricula)
     for name, curriculum in all_curricula.items():
-        yield f"curricula/{name}.md", card(curriculum, *figures.get(name, ()))
+        yield f"curricula/{name}.md", card(curriculum, **figures.get(name, {}))
 
 
 def _index(all_curricula: dict[str, Curriculum]) -> str:
@@ -66,11 +70,13 @@ def needs_memory(task: Task) -> bool | None:
         return None
 
 
-def card(curriculum: Curriculum, graphs: str = "", similarity: str = "") -> str:
-    """Return a card in Markdown; ``graphs`` and ``similarity`` are the files of its figures, if its tasks have some."""
+def card(curriculum: Curriculum, graphs: str = "", similarity: str = "", curves: str = "") -> str:
+    """Return a card in Markdown; ``graphs``, ``similarity`` and ``curves`` are the files of its figures, if any."""
     name = curriculum.name
     overview, *sheets = describe(curriculum)
-    results = curriculum_results(name)
+    results = [study_of(name) or sentence_of(curriculum) or NO_RUN]
+    results += [f"![Mean return of short runs of {name}](../figures/{curves})"] if curves else []
+    results.append(curriculum_results(name))
     parts = [
         ALONE,
         f"# `{name}`",
@@ -83,7 +89,8 @@ def card(curriculum: Curriculum, graphs: str = "", similarity: str = "") -> str:
         *(_of_graphs(curriculum, similarity) if are_graphs(curriculum.tasks) else []),
         *_folded(sheets, len(curriculum.tasks)),
         *_settings(name),
-        *(["## Results", results] if results else []),
+        "## Results",
+        *filter(None, results),
         "## Cite",
         f"Name the curriculum as `{name}`, version {curriculum.version} ({curriculum.fingerprint}), of ctgraph_rl.",
         *(f"```bibtex\n{entry}\n```" for entry in entries_of(curriculum.source)),

@@ -9,6 +9,8 @@ from functools import cache
 from pathlib import Path
 
 import torch
+from results_of import FOLDER
+from short_runs import NAME, draw_curves, lines_of
 
 import curricula
 from ctgraph_rl.tasks.task import are_graphs
@@ -16,36 +18,41 @@ from ctgraph_rl.visualize import curriculum_figure
 from ctgraph_rl.visualize.curriculum_figure import draw_graphs
 from ctgraph_rl.visualize.similarity_figure import draw_similarity
 
-DRAWINGS = {"graphs": draw_graphs, "similarity": draw_similarity}
+DRAWINGS = {"graphs": draw_graphs, "similarity": draw_similarity, "curves": draw_curves}
 
 
-def draw_all(folder: Path) -> dict[str, tuple[str, str]]:
-    """Draw graphs and similarity of curricula of CT-graphs; return the names of the two files by curriculum."""
+def draw_all(folder: Path) -> dict[str, dict[str, str]]:
+    """Draw what is known of each curriculum; return the names of the files by curriculum and kind of drawing."""
     folder.mkdir(parents=True, exist_ok=True)
-    names = [name for name in curricula.names() if are_graphs(curricula.load(name).tasks)]
-    files = {name: tuple(_file(name, kind) for kind in DRAWINGS) for name in names}
-    missing = [
-        (folder / file, name, kind) for name, pair in files.items() for file, kind in zip(pair, DRAWINGS, strict=True)
-    ]
+    files = {name: {kind: _file(name, kind) for kind in _kinds(name)} for name in curricula.names()}
+    missing = [(folder / file, name, kind) for name, of in files.items() for kind, file in of.items()]
     missing = [each for each in missing if not each[0].is_file()]
     with ProcessPoolExecutor(os.cpu_count(), initializer=torch.set_num_threads, initargs=(1,)) as pool:
         list(pool.map(_draw, missing, chunksize=4))
-    wanted = {file for pair in files.values() for file in pair}
+    wanted = {file for of in files.values() for file in of.values()}
     for path in folder.glob("*-*.png"):
         if path.name not in wanted:
             path.unlink()
     return files
 
 
+def _kinds(name: str) -> list[str]:
+    """Return what is drawn: graphs and their similarity of CT-graphs, curves where there are short runs."""
+    kinds = ["graphs", "similarity"] if are_graphs(curricula.load(name).tasks) else []
+    return [*kinds, "curves"] if lines_of(name) else kinds
+
+
 def _file(name: str, kind: str) -> str:
-    digest = hashlib.sha256(f"{curricula.load(name).fingerprint} {_code()}".encode()).hexdigest()
+    digest = hashlib.sha256(f"{curricula.load(name).fingerprint} {_code(kind)}".encode()).hexdigest()
     return f"{name}-{kind}-{digest[:8]}.png"
 
 
 @cache
-def _code() -> str:
-    """Return a digest of the code that draws."""
-    paths = sorted(Path(curriculum_figure.__file__).parent.glob("*.py"))
+def _code(kind: str) -> str:
+    """Return a digest of what draws: the code, and the raw results of short runs."""
+    paths = [Path(__file__).with_name("short_runs.py"), FOLDER / f"{NAME}.csv"]
+    if kind != "curves":
+        paths = sorted(Path(curriculum_figure.__file__).parent.glob("*.py"))
     return hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()
 
 

@@ -43,6 +43,7 @@ TABLES = {
     "adaptation": "studies.adaptation",
     "adaptation_swap": "studies.adaptation_swap",
     "claim_runs": "studies.claim_runs",
+    "every_curriculum": "studies.every_curriculum",
     "task_free": "studies.no_labels.task_free",
     "together_fo_b1": "studies.together",
 }

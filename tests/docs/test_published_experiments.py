@@ -7,6 +7,7 @@ import re
 from typing import NamedTuple
 
 import pytest
+import yaml
 from helpers.paths import CHECKOUT
 
 import curricula
@@ -34,10 +35,12 @@ def names_in(cell: str) -> list[str]:
     return re.findall(r"`(\w+)`", cell)
 
 
-def curricula_with_results() -> set[str]:
-    """The named curricula that raw results are of."""
+def curricula_with_a_study() -> set[str]:
+    """The named curricula that raw results of a study are of."""
     found = {"su_b1_4tasks", "co_hard", "nm_uniform_goals"}  # files of one curriculum do not name it
     for path in RESULTS.glob("*.csv"):
+        if path.stem == "every_curriculum":
+            continue  # the short runs, which cards show
         with open(path, newline="", encoding="utf-8") as file:
             lines = csv.DictReader(file)
             column = "curriculum" if "curriculum" in (lines.fieldnames or ()) else "configuration"
@@ -62,7 +65,26 @@ def test_every_part_that_cannot_be_recovered_stands_in_one_row():
 
 
 def test_what_the_table_calls_rerun_has_raw_results_and_what_has_is_called_so():
-    assert {name for row in ROWS for name in names_in(row.rerun)} == curricula_with_results()
+    assert {name for row in ROWS for name in names_in(row.rerun)} == curricula_with_a_study()
+
+
+def test_rows_say_where_short_runs_are():
+    with open(RESULTS / "every_curriculum.csv", newline="", encoding="utf-8") as file:
+        short = {line["curriculum"] for line in csv.DictReader(file)}
+
+    assert short <= set(curricula.names()) - curricula_with_a_study()
+    has_nothing_else = [row for row in ROWS if not names_in(row.rerun)]
+    assert {row.rerun for row in has_nothing_else} <= {"no", "short runs"}
+    for row in has_nothing_else:
+        assert (row.rerun == "short runs") == bool(short & {*names_in(row.curricula)}), row.source
+
+
+def test_every_curriculum_without_a_study_is_in_the_experiment_of_short_runs():
+    settings = yaml.safe_load((CHECKOUT / "conf" / "experiment" / "every_curriculum.yaml").read_text(encoding="utf-8"))
+    variants = settings["hydra"]["sweeper"]["variants"]
+
+    planned = {name for variant in variants for name in variant["curriculum"].split(",")}
+    assert planned == set(curricula.names()) - curricula_with_a_study()
 
 
 def test_every_row_says_what_is_missing_and_links_pages_that_exist():

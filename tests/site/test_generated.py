@@ -84,6 +84,56 @@ def test_a_card_of_a_curriculum_has_its_parts(site):
     assert "baselines.md" in card.split("## Results")[1]
 
 
+def test_the_card_of_every_named_curriculum_has_a_line_on_results(site):
+    """A study's page, or short runs, which are never of the same curriculum, or that there is no run yet."""
+    short_runs = site("short_runs")
+    run = {line["curriculum"] for line in short_runs.raw(short_runs.NAME)}
+
+    first = {}
+    for name in curricula.names():
+        lines = [short_runs.study_of(name), short_runs.sentence_of(curricula.load(name))]
+        first[name] = [line.split()[0] for line in lines if line]
+        assert len(first[name]) == (name in run or any(name in names for names in short_runs.STUDIES.values())), name
+    assert first["ct8"] == ["Results"] and first["fo_b2_8tasks"] == ["`agent=ppo`,"]
+
+
+@pytest.mark.parametrize("name", ["ct8", "fo_b2_8tasks"])
+def test_a_card_begins_its_results_with_that_line(site, name):
+    card = site("curriculum_cards").card(curricula.load(name))
+    begins = {"ct8": "Results are on the page [lifelong learning]", "fo_b2_8tasks": "`agent=ppo`, 102,400 instead of "}
+
+    assert card.split("## Results\n\n")[1].startswith(begins[name])
+
+
+def test_a_card_without_a_result_says_so(site, monkeypatch):
+    monkeypatch.setattr(site("short_runs"), "lines_of", lambda name: {})
+
+    card = site("curriculum_cards").card(curricula.load("fo_b2_8tasks"))
+
+    assert card.split("## Results\n\n")[1].startswith("No run yet: `ctgraph-rl -m experiment=every_curriculum`")
+
+
+def test_a_card_shows_its_short_runs_in_one_line_and_one_figure(site):
+    card = site("curriculum_cards").card(curricula.load("fo_b2_8tasks"), curves="curves.png")
+    results = card.split("## Results")[1].split("## Cite")[0].split("\n\n")
+
+    line, figure = (part for part in results if part.strip())
+    assert re.fullmatch(
+        r"`agent=ppo`, 102,400 instead of 204,800 frames a task\. Mean return over all tasks at the end: 0\.12.*"
+        r" with fine-tuning \(\d seeds?; \d\.\d\d right after each task\).* The optimum is 1; random actions have .*",
+        line,
+    )
+    assert figure == "![Mean return of short runs of fo_b2_8tasks](../figures/curves.png)"
+
+
+def test_the_studies_of_cards_are_those_of_the_table_of_published_experiments(site):
+    page = (CHECKOUT / "docs" / "reference" / "published_experiments.md").read_text(encoding="utf-8")
+    cells = [line.strip("|").split(" | ")[4] for line in page.splitlines() if line.startswith("| ")][1:]
+
+    named = {name for names in site("short_runs").STUDIES.values() for name in names}
+    assert named == {name for cell in cells for name in re.findall(r"`(\w+)`", cell)}
+
+
 def test_a_fully_observable_curriculum_needs_no_memory(site):
     cards = site("curriculum_cards")
 

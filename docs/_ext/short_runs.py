@@ -1,0 +1,118 @@
+"""What short runs reached on a curriculum, as one line and one figure: docs/results/every_curriculum.csv."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from pathlib import Path
+from statistics import fmean
+
+from results_of import PAGE, Line, raw
+from studies.raw import mean_of, numbers_in
+
+from ctgraph_rl import Curriculum
+from ctgraph_rl.report.intervals import Bounds
+from ctgraph_rl.visualize.style import new_figure, save_figure
+
+NAME = "every_curriculum"
+
+METHODS = {"finetune": "fine-tuning", "mask_ri": "Mask RI", "ewc": "EWC", "multitask": "multitask"}
+"""Methods in the order of lines and figures, in words."""
+
+STYLES = dict(zip(METHODS, ("-", "--", ":", "-."), strict=True))
+
+STUDIES = {
+    "baselines": ("penn_a_swap", "single_task", "su_b1_4tasks"),
+    "lifelong": ("ct8", "ct8_md", "ct12", "fo_b1_4images", "fo_b1_4tasks", "fo_b1_depth2to5"),
+    "no_labels": (
+        *("su_b1_4images", "co_b1_4images", "posr_b1_4images", "dick2020_pair", "swoks_2x4"),
+        *("task_free_abrupt", "task_free_gradual", "task_free_recurring"),
+    ),
+    "claims": ("fo_b1_dissimilar", "stochastic_grouped"),
+    "memory": ("co_hard",),
+    "adaptation": ("nm_uniform_goals",),
+    "collectives": ("ct28", "ct28_mosaic_skips_d5", "l2d2c_16x16"),
+}
+"""Curricula by the page of the study that is about them."""
+
+TITLES = {
+    "baselines": "baselines",
+    "lifelong": "lifelong learning",
+    "no_labels": "learning without labels",
+    "claims": "the paper's sentences",
+    "memory": "memory cells",
+    "adaptation": "adaptation",
+    "collectives": "learners that share",
+}
+
+
+def lines_of(name: str) -> dict[tuple[str, str], list[Line]]:
+    """Return the lines of a curriculum's short runs by agent and method, in the order of `METHODS`."""
+    found: dict[tuple[str, str], list[Line]] = defaultdict(list)
+    for line in raw(NAME):
+        if line["curriculum"] == name:
+            found[line["agent"], line["method"]].append(line)
+    return dict(sorted(found.items(), key=lambda item: list(METHODS).index(item[0][1])))
+
+
+def study_of(name: str) -> str:
+    """Return a link to the study that is about a curriculum, or nothing."""
+    links = [f"[{TITLES[page]}]({PAGE}/{page}.md)" for page, names in STUDIES.items() if name in names]
+    return f"Results are on the page {', '.join(links)}." if links else ""
+
+
+def sentence_of(curriculum: Curriculum) -> str:
+    """Return what short runs of a curriculum reached, in one line, or nothing."""
+    of = lines_of(curriculum.name)
+    if not of:
+        return ""
+    (agent, _), first_lines = next(iter(of.items()))
+    parts = [_reached(method, lines) for (_, method), lines in of.items()]
+    return (
+        f"`agent={agent}`, {_frames(curriculum, first_lines[0])}. Mean return over all tasks at the end: "
+        f"{'; '.join(parts)}.{_known(first_lines[0])} Raw: `{NAME}.csv`."
+    )
+
+
+def _frames(curriculum: Curriculum, line: Line) -> str:
+    """Return the frames of a block, and those of the curriculum where a run was shorter."""
+    ran, full = int(line["block_frames"]), curriculum.blocks[0].num_frames
+    what = "frames a task" if len(curriculum.blocks) > 1 else "frames"
+    return f"{ran:,} {what}" if ran == full else f"{ran:,} instead of {full:,} {what}"
+
+
+def _reached(method: str, lines: list[Line]) -> str:
+    """Return the mean return at the end with its interval, and right after each task's own block."""
+    first = lines[0]
+    bounds = Bounds(float(first["lowest"] or "-inf"), float(first["highest"] or "inf"), noisy=True)
+    ids = ", with task ids" if first["task_id"] else ""
+    seeds = f"{len(lines)} seed{'s' * (len(lines) > 1)}"
+    number = mean_of(numbers_in(lines, "end"), bounds)
+    if not first["forgetting"]:
+        return f"{number} with {METHODS[method]} ({seeds}{ids})" if method != "finetune" else f"{number} ({seeds})"
+    own = fmean(numbers_in(lines, "learned"))
+    return f"{number} with {METHODS[method]} ({seeds}{ids}; {own:.2f} right after each task)"
+
+
+def _known(line: Line) -> str:
+    """Return the optimum and what random actions have, where they are known."""
+    if not line["optimum"]:
+        return ""
+    return f" The optimum is {float(line['optimum']):.3g}; random actions have {float(line['random']):.2g}."
+
+
+def draw_curves(curriculum: Curriculum, path: Path) -> None:
+    """Draw the mean return over all tasks of each short run over its frames."""
+    figure = new_figure(6, 2.2)
+    axes = figure.subplots()
+    for (_, method), lines in lines_of(curriculum.name).items():
+        for number, line in enumerate(lines):
+            frames = [int(at) for at in line["at"].split()]
+            values = [float(value) for value in line["curve"].split()]
+            label = METHODS[method] if number == 0 else None
+            axes.plot(frames, values, STYLES[method], marker=".", color="0.2", lw=1, ms=3, label=label)
+    optimum = next(iter(lines_of(curriculum.name).values()))[0]["optimum"]
+    if optimum:
+        axes.axhline(float(optimum), color="0.6", lw=0.8, label="optimum")
+    axes.set(xlabel="frames", ylabel="mean return")
+    axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
+    save_figure(figure, path)
