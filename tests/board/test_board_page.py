@@ -66,6 +66,10 @@ def test_what_the_page_says_of_single_lines_holds(made):
     assert deep.standings[0].entry.scores == (1.0,) * 10 and deep.variant.curriculum.num_frames == 102_400
     assert f"A random policy needs {deep.ceilings.random_frames:,.0f} for its first reward" in page.replace("\n", " ")
 
+    kept = alone["forgetting", ""].standings[0].entry
+    assert "learns 76 of 80 tasks, all eight in seven of ten seeds, and forgets none" in page
+    assert (8 * sum(kept.scores), kept.scores.count(1.0), set(kept.values["forgetting"])) == (76, 7, {0.0})
+
     longer = alone["memory", "depth 2, expected length 30"].standings[0].entry
     returns = sorted(longer.values["average_performance"])
     assert "eight of ten seeds have the optimum with 30 steps, and the others 0.85 and 0.91" in page
