@@ -11,7 +11,6 @@ import itertools
 import random
 from collections.abc import Iterable, Sequence
 from dataclasses import fields, replace
-from functools import partial
 from math import prod
 from typing import Any
 
@@ -162,10 +161,13 @@ def new_images(tasks: OneOrMore, num_sets: int, kinds: Sequence[str] = ("decisio
 
     def vary(task: Task) -> Tasks:
         ranges = [task.observations.ids(StateType[kind.upper()]) for kind in kinds if kind in MOVABLE]
-        first = min(ranges, default=(0, 0))[0]
+        first = min((first for first, _ in ranges), default=0)
         last = max((last for _, last in ranges), default=0)
-        start = task.observations.last_id + 1 - first
-        shifts = (0, *(start + i * (last - first + 1) for i in range(num_sets - 1)))
+        size = last - first + 1
+        beyond = task.observations.last_id + 1 - first
+        shifts = [0]
+        for number in range(num_sets - 1):
+            shifts.append(beyond + number * size)
         return shifted_ids(task, shifts, kinds)
 
     return each(tasks, vary)
@@ -180,8 +182,12 @@ def read_variation(tasks: OneOrMore, read_noise: int, read_rotation: int = 0) ->
         read_noise: largest addition to each pixel, in 0..255.
         read_rotation: largest rotation in whole degrees, in 0..359.
     """
-    changed = partial(replace, read_noise=read_noise, read_rotation=read_rotation)
-    return each(tasks, lambda task: [replace(task, observations=changed(task.observations))])
+
+    def vary(task: Task) -> list[Task]:
+        varied = replace(task.observations, read_noise=read_noise, read_rotation=read_rotation)
+        return [replace(task, observations=varied)]
+
+    return each(tasks, vary)
 
 
 # shape

@@ -26,8 +26,8 @@ def ct8(num_frames: int = 102_400) -> Curriculum:
     Args:
         num_frames: frames per task.
     """
-    listing = "1:000 1:001 1:010 1:011 1:100 1:101 1:110 1:111"
-    return _curriculum("ct8", MASKS, listing, ids=range(8), num_ids=8, num_frames=num_frames)
+    tasks = words("1:000 1:001 1:010 1:011 1:100 1:101 1:110 1:111")
+    return _curriculum("ct8", MASKS, tasks, ids=range(8), num_ids=8, num_frames=num_frames)
 
 
 def ct12(num_frames: int = 102_400) -> Curriculum:
@@ -36,8 +36,8 @@ def ct12(num_frames: int = 102_400) -> Curriculum:
     Args:
         num_frames: frames per task.
     """
-    listing = "1:00 1:000 1:01 1:001 1:10 1:010 1:11 1:011 1:100 1:101 1:110 1:111"
-    return _curriculum("ct12", MASKS, listing, ids=range(12), num_ids=12, num_frames=num_frames)
+    tasks = words("1:00 1:000 1:01 1:001 1:10 1:010 1:11 1:011 1:100 1:101 1:110 1:111")
+    return _curriculum("ct12", MASKS, tasks, ids=range(12), num_ids=12, num_frames=num_frames)
 
 
 def ct8_md(num_frames: int = 102_400) -> Curriculum:
@@ -46,9 +46,9 @@ def ct8_md(num_frames: int = 102_400) -> Curriculum:
     Args:
         num_frames: frames per task.
     """
-    listing = "1:00 1:01 1:000 1:001 1:0000 1:0001 1:00000 1:00001"
-    ids = pool_ids(words(listing), [(1, depth) for depth in range(2, 6)])
-    return _curriculum("ct8_md", MASKS, listing, ids=ids, num_ids=60, num_frames=num_frames)
+    tasks = words("1:00 1:01 1:000 1:001 1:0000 1:0001 1:00000 1:00001")
+    ids = pool_ids(tasks, [(1, 2), (1, 3), (1, 4), (1, 5)])
+    return _curriculum("ct8_md", MASKS, tasks, ids=ids, num_ids=60, num_frames=num_frames)
 
 
 def single_task(depth: int = 2, num_frames: int = 102_400) -> Curriculum:
@@ -71,12 +71,15 @@ def ct2_interfering(num_frames: int = 51_200) -> Curriculum:
     Args:
         num_frames: frames per task.
     """
-    return _curriculum("ct2_interfering", BASELINES, "1:000 1:111", ids=(0, 7), num_ids=8, num_frames=num_frames)
+    tasks = words("1:000 1:111")
+    return _curriculum("ct2_interfering", BASELINES, tasks, ids=(0, 7), num_ids=8, num_frames=num_frames)
 
 
-def _curriculum(name: str, source: str, listing: str, ids: Sequence[int], num_ids: int, num_frames: int) -> Curriculum:
-    tasks = tuple(one_wait_image(path, seed) for seed, path in words(listing))
-    return labelled(name, source, tasks, ids=ids, num_task_ids=num_ids, num_frames=num_frames)
+def _curriculum(
+    name: str, source: str, named: list[tuple[int, str]], ids: Sequence[int], num_ids: int, num_frames: int
+) -> Curriculum:
+    tasks = tuple(one_wait_image(path, seed) for seed, path in named)
+    return labelled(name, source, tasks, ids, num_ids, num_frames=num_frames)
 
 
 NAMED = by_name(ct2_interfering, ct8, ct8_md, ct12, single_task)

@@ -56,7 +56,8 @@ def configured(configuration: str, image_seed: int = 1) -> Task:
     """
     unknown = f"unknown configuration {configuration!r}: {did_you_mean(str(configuration), KINDS)}"
     require((configuration in KINDS, unknown))
-    return CONFIGURATIONS[f"CT-{configuration.replace('_', '-').upper()}"](image_seed=image_seed)
+    name = configuration.replace("_", "-").upper()
+    return CONFIGURATIONS[f"CT-{name}"](image_seed=image_seed)
 
 
 def one_goal(configuration: str, image_seed: int = 1) -> Task:
@@ -317,9 +318,10 @@ def stochastic_grouped(
         between: expected distance of images of different groups.
     """
     images = GroupedImages((group_size,) * 5, within, between, image_seed)
-    names = ("home_ids", "fail_ids", "decision_ids", "wait_ids", "end_ids")
-    ids = {name: (i * group_size, (i + 1) * group_size - 1) for i, name in enumerate(names)}
-    task = Task(CTGraph(2, 2), (1, 1), Observations(**ids), images)  # type: ignore[arg-type]
+    ranges = [(first, first + group_size - 1) for first in range(0, 5 * group_size, group_size)]
+    home, fail, decision, wait, end = ranges
+    observations = Observations(wait_ids=wait, decision_ids=decision, end_ids=end, home_ids=home, fail_ids=fail)
+    task = Task(CTGraph(2, 2), (1, 1), observations, images)
     return _curriculum("stochastic_grouped", axes.all_goals(task), num_frames)
 
 

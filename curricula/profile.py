@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ctgraph_rl.checks import NamedValues, by_name
 from ctgraph_rl.core.graph import CTGraph
@@ -40,9 +40,10 @@ def profile_observability(num_frames: int = 409_600) -> Curriculum:
     """
     graph = CTGraph(2, 2, 0.5)
     tasks = []
-    for seed, kind in enumerate(OBSERVABILITY, 1):
+    for image_seed, kind in enumerate(OBSERVABILITY, 1):
         shown = observations_of(graph, kind)
-        tasks.append(Task(graph, (1, 2), shown, PaperImages(shown.last_id + 1, seed)))
+        images = PaperImages(shown.last_id + 1, image_seed)
+        tasks.append(Task(graph, (1, 2), shown, images))
     return _profile("observability", [tasks], num_frames, Evaluation(before=False))
 
 
@@ -53,11 +54,11 @@ def profile_memory(num_frames: int = 614_400) -> Curriculum:
         num_frames: frames of the four tasks together.
     """
     lengths = ((2, 0.0), (2, 0.5), (3, 0.5), (4, 0.5))
-    tasks = [
-        ct_graph(2, depth, p, (1, 2, 1, 2)[:depth], fully_observable=False, image_seed=seed)
-        for seed, (depth, p) in enumerate(lengths, 1)
-    ]
-    return _profile("memory", [tasks], num_frames, Evaluation(before=False), guide_frames=num_frames // 2)
+    tasks = []
+    for seed, (depth, p) in enumerate(lengths, 1):
+        tasks.append(ct_graph(2, depth, p, _alternating(depth), fully_observable=False, image_seed=seed))
+    protocol = Protocol(guide_frames=num_frames // 2)
+    return _profile("memory", [tasks], num_frames, Evaluation(before=False), protocol)
 
 
 def profile_sparsity(num_frames: int = 102_400) -> Curriculum:
@@ -76,7 +77,8 @@ def profile_adaptation(num_frames: int = 61_440) -> Curriculum:
     Args:
         num_frames: frames of each goal.
     """
-    return _profile("adaptation", given_goals(ct_graph(2, 3), EIGHT), num_frames, CURVES, task_id="one_hot")
+    tasks = given_goals(ct_graph(2, 3), EIGHT)
+    return _profile("adaptation", tasks, num_frames, CURVES, protocol=Protocol("one_hot"))
 
 
 def profile_similarity(num_frames: int = 61_440) -> Curriculum:
@@ -94,8 +96,10 @@ def profile_hierarchy(num_frames: int = 102_400) -> Curriculum:
     Args:
         num_frames: frames of each goal.
     """
-    nested = growing_depth(ct_graph(2, 4, 0.0, _alternating(4), image_seed=2), (2, 3, 4))
-    return _profile("hierarchy", [ct_graph(2, 4, 0.0, _alternating(4)), *nested], num_frames, CURVES)
+    scratch = ct_graph(2, 4, 0.0, _alternating(4))
+    deepest = ct_graph(2, 4, 0.0, _alternating(4), image_seed=2)
+    tasks = [scratch, *growing_depth(deepest, (2, 3, 4))]
+    return _profile("hierarchy", tasks, num_frames, CURVES)
 
 
 def profile_attention(num_frames: int = 204_800) -> Curriculum:
@@ -105,13 +109,11 @@ def profile_attention(num_frames: int = 204_800) -> Curriculum:
         num_frames: frames.
     """
     [task] = as_tasks(co_hard(2, 0.5, unique_decisions=True, num_wait_images=100).tasks)  # type: ignore[arg-type]
-    shown = task.observations
-    last = shown.last_id
-    images = PaperImages(last + 101)
-    other = replace(shown, wait_ids=(last + 1, last + 100))
-    trained = replace(task, images=images)
-    evaluation = Evaluation(400, before=False, held_out=(replace(trained, observations=other),))
-    return _profile("attention", [trained], num_frames, evaluation)
+    last = task.observations.last_id
+    task = replace(task, images=PaperImages(last + 101))
+    other = replace(task.observations, wait_ids=(last + 1, last + 100))
+    held_out = replace(task, observations=other)
+    return _profile("attention", [task], num_frames, Evaluation(400, before=False, held_out=(held_out,)))
 
 
 def profile_exploration(num_frames: int = 614_400) -> Curriculum:
@@ -142,12 +144,13 @@ def profile_innate(num_frames: int = 102_400) -> Curriculum:
     Args:
         num_frames: frames of each block.
     """
-    decisions = _alternating(4)
-    deepest = ct_graph(2, 4, 0.0, decisions, image_seed=2)
+    scratch = ct_graph(2, 4, 0.0, _alternating(4))
+    deepest = ct_graph(2, 4, 0.0, _alternating(4), image_seed=2)
     [two, three] = growing_depth(deepest, (2, 3))
-    graphs = [(two, (2, 1), 0.0), (two, (2, 2), 0.5), (three, (2, 1, 2), 0.0), (three, (2, 2, 1), 0.5)]
-    innate = [replace(task, goal=goal, graph=replace(task.graph, wait_prob=p)) for task, goal, p in graphs]
-    return _profile("innate", [ct_graph(2, 4, 0.0, decisions), innate, deepest], num_frames, CURVES)
+    innate = []
+    for task, goal, p in ((two, (2, 1), 0.0), (two, (2, 2), 0.5), (three, (2, 1, 2), 0.0), (three, (2, 2, 1), 0.5)):
+        innate.append(replace(task, goal=goal, graph=replace(task.graph, wait_prob=p)))
+    return _profile("innate", [scratch, innate, deepest], num_frames, CURVES)
 
 
 def _alternating(depth: int) -> tuple[int, ...]:
@@ -156,10 +159,13 @@ def _alternating(depth: int) -> tuple[int, ...]:
 
 
 def _profile(
-    name: str, blocks: Sequence[OneOrMore], num_frames: int, evaluation: Evaluation, **protocol: Any
+    name: str,
+    blocks: Sequence[OneOrMore],
+    num_frames: int,
+    evaluation: Evaluation,
+    protocol: Protocol | None = None,
 ) -> Curriculum:
-    how = Protocol(**protocol)
-    return sequence(f"profile_{name}", blocks, num_frames, 1, SOURCE, evaluation=evaluation, protocol=how)
+    return sequence(f"profile_{name}", blocks, num_frames, 1, SOURCE, evaluation=evaluation, protocol=protocol)
 
 
 class Property(NamedTuple):
