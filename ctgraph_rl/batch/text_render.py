@@ -33,17 +33,24 @@ def as_text(tasks: Sequence[Task], state: RowState, observation: Tensor, white: 
 def _place(task: Task, kind: int, node: int, goal_leaf: int, step_count: int) -> str:
     """Return where a row is, by branches: ``wait state after 1 2, step 4, goal 1 1``; and what is swapped."""
     graph = task.graph
-    goal, way = (" ".join(map(str, graph.path(at))) for at in (graph.num_decision_states + goal_leaf, node))
-    place = f"{StateType(kind).name.lower()} state" + (f" after {way}" if way else "")
-    text = f"{place}, step {step_count}, goal {goal}"
+    goal = _spaced(graph.path(graph.num_decision_states + goal_leaf))
+    way = f" after {_spaced(graph.path(node))}" if node else ""
+    text = f"{StateType(kind).name.lower()} state{way}, step {step_count}, goal {goal}"
     if task.swapped_branches is None:
         return text
     path, (first, second) = task.swapped_branches
-    at = f"after {' '.join(map(str, path))}" if path else "at the first decision"
+    at = f"after {_spaced(path)}" if path else "at the first decision"
     return f"{text}, {first} and {second} swapped {at}"
+
+
+def _spaced(path: Sequence[int]) -> str:
+    return " ".join(map(str, path))
 
 
 def _blocks(observation: NDArray[np.uint8], white: int) -> str:
     """Return an image as lines of blocks of grey, two for each pixel; a vector as one line."""
-    levels = (observation.reshape(-1, observation.shape[-1]).astype(int) * 4 // white).clip(0, 4)
-    return "\n".join("".join(GREYS[level] * 2 for level in line) for line in levels)
+    pixels = observation.reshape(-1, observation.shape[-1]).astype(int)
+    lines = []
+    for levels in (pixels * 4 // white).clip(0, 4):
+        lines.append("".join(GREYS[level] * 2 for level in levels))
+    return "\n".join(lines)

@@ -135,11 +135,12 @@ def graph_containment(tasks: Sequence[Task]) -> Tensor:
         smaller = min(one.graph.num_decision_states, other.graph.num_decision_states)
         common = _common(one, other)
         b = common.branching_factor
-        swaps = {one.swapped_branches, other.swapped_branches}
         rewired = set()  # decision states of the common tree that lead elsewhere in one of the tasks
-        for swap in swaps if len(swaps) > 1 else ():
-            if swap is not None and len(swap[0]) < common.depth and max((*swap[0], swap[1][0])) <= b:
-                rewired.add(swap[0])
+        if one.swapped_branches != other.swapped_branches:
+            for swap in filter(None, (one.swapped_branches, other.swapped_branches)):
+                path, (first, _) = swap
+                if len(path) < common.depth and max((*path, first)) <= b:
+                    rewired.add(path)
         return (common.num_decision_states - len(rewired)) / smaller
 
     return _matrix(_tasks(tasks), share)
@@ -194,7 +195,8 @@ class _Choices:
 
     def of_path(self, kind: StateType, path: tuple[int, ...]) -> int:
         """The set at a node of a collapsed tree by the decisions that lead to it."""
-        return self.sets[kind, len(path)][ON_THE_WAY if path == self.task.goal[: len(path)] else ELSEWHERE]
+        level = len(path)
+        return self.sets[kind, level][ON_THE_WAY if path == self.task.goal[:level] else ELSEWHERE]
 
     def of_nodes(self, kind: StateType, level: int, nodes: Sequence[int]) -> list[int]:
         """The sets at nodes by their numbers within a level."""
@@ -239,12 +241,13 @@ def _best(values: Tensor, fails: float, num_actions: int, first: int, margin: fl
     """The sets of best actions: ``values`` [n, m] are those of the actions from ``first`` on, any other one fails."""
     best = values.amax(-1).clamp_min(fails) - margin
     rows, which = torch.unique(values >= best.unsqueeze(-1), dim=0, return_inverse=True)
-    others = (1 << num_actions) - 1 - (((1 << values.shape[1]) - 1) << first)
+    tried = ((1 << values.shape[1]) - 1) << first
+    others = (1 << num_actions) - 1 - tried
     packed = np.packbits(rows.numpy(), axis=1, bitorder="little")
     chosen = [int.from_bytes(row.tobytes(), "little") << first for row in packed]
     sets = []
     for row, failing in zip(which.tolist(), (fails >= best).tolist(), strict=True):
-        sets.append(chosen[row] | (others if failing else 0))
+        sets.append(chosen[row] | others if failing else chosen[row])
     return sets
 
 
@@ -274,7 +277,8 @@ def _equal_everywhere(one: _Choices, other: _Choices, kind: StateType, level: in
     """Equal states of a level, all visited."""
 
     def sets(choice: _Choices) -> list[int]:
-        return choice.of_nodes(kind, level, _nodes(choice.task.graph.branching_factor, b, level))
+        nodes = _nodes(choice.task.graph.branching_factor, b, level)
+        return choice.of_nodes(kind, level, nodes)
 
     return sum(a == z for a, z in zip(sets(one), sets(other), strict=True))
 
@@ -330,7 +334,9 @@ def _ids(task: Task, kind: StateType) -> Sequence[int]:
 def _levels(task: Task, kind: StateType) -> range:
     """Numbers of decisions taken that states of a kind can have."""
     depth = task.graph.depth
-    return {StateType.WAIT: range(depth + 1), StateType.DECISION: range(depth)}.get(kind, range(depth, depth + 1))
+    if kind == StateType.WAIT:
+        return range(depth + 1)
+    return range(depth) if kind == StateType.DECISION else range(depth, depth + 1)
 
 
 def _unique_ids(task: Task, kind: StateType, level: int) -> list[int]:

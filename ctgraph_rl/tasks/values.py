@@ -91,7 +91,8 @@ def policy_value(task: Task, policy: Tensor, gamma: float = 1.0) -> float:
 
 def success_prob(task: Task, policy: Tensor) -> float:
     """The probability that a memoryless policy reaches the goal, whatever the rewards; arguments as `policy_value`."""
-    return policy_value(replace(task, reward_fn=Needle(), goal_reward=1.0, fail_reward=0.0, step_reward=0.0), policy)
+    paid = replace(task, reward_fn=Needle(), goal_reward=1.0, fail_reward=0.0, step_reward=0.0)
+    return policy_value(paid, policy)
 
 
 def memoryless_ceiling(task: Task, deterministic: bool = False) -> float:
@@ -253,11 +254,12 @@ class _EveryNode:
     def end_rewards(self) -> Tensor:
         """float64 [b^d]."""
         task = self.task
-        leaf = torch.arange(task.graph.num_end_states, device="cpu")
-        of_task = (task.goal_leaf, task.graph.branching_factor, task.graph.depth)
-        goal, b, depth = (torch.full_like(leaf, value) for value in of_task)
-        arrival = Arrival(leaf, goal, b, depth, task.graph.depth)
-        share = task.reward_fn(arrival)
+        graph = task.graph
+        leaf = torch.arange(graph.num_end_states, device="cpu")
+        goal = torch.full_like(leaf, task.goal_leaf)
+        b = torch.full_like(leaf, graph.branching_factor)
+        depth = torch.full_like(leaf, graph.depth)
+        share = task.reward_fn(Arrival(leaf, goal, b, depth, graph.depth))
         return task.goal_reward * share.to(torch.float64)
 
     def children(self, values: Tensor, level: int) -> Tensor:
@@ -368,9 +370,8 @@ class _Memoryless:
         first, last = self.task.observations.ids(kind)
         if not self.task.observations.is_unique(kind):
             return self.policy[first : last + 1].mean(0, keepdim=True)
-        number = self.task.observations.first_of_level(self.task.graph, kind, level) + torch.arange(
-            b**level, device="cpu"
-        )
+        before = self.task.observations.first_of_level(self.task.graph, kind, level)
+        number = before + torch.arange(b**level, device="cpu")
         return self.policy[first + number % (last - first + 1)]
 
 

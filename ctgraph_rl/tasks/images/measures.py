@@ -43,8 +43,11 @@ def distances(images: Tensor, groups: Sequence[int]) -> Distances:
     sums = (mixed + mixed.T - 2 * up_to @ up_to.T) / (images[0].numel() * WHITE)
     pairs = sizes.unsqueeze(1) * sizes - sizes.diag()  # of different images, in both orders
     same = torch.eye(len(numbers), dtype=torch.bool, device=images.device)
-    within, between = ((sums[where].sum() / pairs[where].sum()).item() for where in (same, ~same))
-    return Distances(within, between, sums / pairs)
+
+    def mean(where: Tensor) -> float:
+        return (sums[where].sum() / pairs[where].sum()).item()
+
+    return Distances(mean(same), mean(~same), sums / pairs)
 
 
 def _counts_up_to_level(images: Tensor) -> Tensor:
@@ -66,7 +69,5 @@ def first_of_each(images: Tensor) -> Tensor:
     """Return the positions of the images that do not repeat an earlier one, in order."""
     _, group = torch.unique(images.flatten(1), dim=0, return_inverse=True)
     positions = torch.arange(len(images), device="cpu")
-    first = torch.full_like(group[: int(group.max()) + 1], len(images)).scatter_reduce(
-        0, group, positions, reduce="amin"
-    )
-    return first.sort().values
+    none = torch.full_like(group[: int(group.max()) + 1], len(images))
+    return none.scatter_reduce(0, group, positions, reduce="amin").sort().values
