@@ -191,6 +191,15 @@ def test_similarity_sees_the_one_transition():
     assert observation_agreement(tasks)[0, 1].item() < observation_agreement(tasks)[0, 2].item() == 1
 
 
+def test_what_is_swapped_outside_of_the_common_tree_does_not_count():
+    small = fully_observable(2, 2, goal=(1, 2))
+    deep = replace(fully_observable(2, 3, goal=(1, 2, 1)), swapped_branches=((1, 1), (1, 2)))
+    wide = replace(fully_observable(3, 2, goal=(1, 2)), swapped_branches=((3,), (1, 2)))
+
+    assert graph_containment([small, deep])[0, 1].item() == 1
+    assert graph_containment([small, wide])[0, 1].item() == 1
+
+
 def test_a_pair_has_labels_of_its_own_and_survives_json_and_replaces_nothing_else():
     plain = fully_observable(2, 2)
     pair = (plain, replace(plain, swapped_branches=[[2], [1, 2]]))
