@@ -70,6 +70,12 @@ def test_what_the_page_says_of_single_lines_holds(made):
     assert "learns 76 of 80 tasks, all eight in seven of ten seeds, and forgets none" in page
     assert (8 * sum(kept.scores), kept.scores.count(1.0), set(kept.values["forgetting"])) == (76, 7, {0.0})
 
+    growing = alone["growing_depth", "ct8_md"]
+    assert "Mask LC learns all eight tasks, up to depth 5, in every seed, and forgets none" in page
+    assert max(task.graph.depth for task in growing.variant.curriculum.tasks) == 5
+    assert set(growing.standings[0].entry.scores) == {1.0}
+    assert set(growing.standings[0].entry.values["forgetting"]) == {0.0}
+
     longer = alone["memory", "depth 2, expected length 30"].standings[0].entry
     returns = sorted(longer.values["average_performance"])
     assert "eight of ten seeds have the optimum with 30 steps, and the others 0.85 and 0.91" in page
