@@ -50,7 +50,8 @@ from ctgraph_rl.checks import at_least_one, at_most, fraction, not_negative, pos
 STATE = ("eligibility", "average", "trial")
 """The state of an environment; ``trial`` says that the average lasts over episodes."""
 
-RMSPROP_ALPHA, RMSPROP_EPS = 0.95, 0.01
+RMSPROP_ALPHA = 0.95
+RMSPROP_EPS = 0.01
 """As published."""
 
 

@@ -66,7 +66,8 @@ NEURONS = (False, False, False, False, True, True, True)
 FIRST_PRECISION = 10.0
 """Of the mutation that gives the first individuals their genes."""
 
-WEIGHTS, OUTPUTS = f"{UNSTORED}weights", f"{UNSTORED}outputs"
+WEIGHTS = f"{UNSTORED}weights"
+OUTPUTS = f"{UNSTORED}outputs"
 
 
 class Population(NamedTuple):
@@ -252,7 +253,8 @@ def mutated(population: Population, precision: float) -> Population:
 def winners(fitness: Tensor, segment_size: int, offset: int) -> Tensor:
     """Return the parent of each child, int64 [individuals]: itself before the offset, then the best of its segment."""
     count = len(fitness)
-    segments = pad(fitness[offset:], (0, (offset - count) % segment_size), value=-torch.inf).view(-1, segment_size)
+    padding = (0, (offset - count) % segment_size)
+    segments = pad(fitness[offset:], padding, value=-torch.inf).view(-1, segment_size)
     first = offset + segment_size * torch.arange(len(segments), device=fitness.device)
     best = (first + segments.argmax(dim=1)).repeat_interleave(segment_size)
     return torch.cat([torch.arange(offset, device=fitness.device), best])[:count]
@@ -268,7 +270,10 @@ def first_population(count: int, num_inputs: int) -> Population:
 
 def layers(*widths: int) -> nn.Sequential:
     """Return linear layers with ReLU."""
-    return nn.Sequential(*(part for pair in pairwise(widths) for part in (linear_layer(*pair), nn.ReLU())))
+    found = nn.Sequential()
+    for before, after in pairwise(widths):
+        found.extend([linear_layer(before, after), nn.ReLU()])
+    return found
 
 
 class Autoencoder(nn.Module):
@@ -388,9 +393,13 @@ class PennA(TakesNumbers, TensorDictModuleBase):
             delete_prob=delete_prob,
             precision=precision,
         )
-        self.num_envs, self.num_steps, self.num_batches = num_envs, num_steps, num_batches
-        self.num_trials, self.life_episodes = num_trials, life_episodes
-        self.num_updates, self.batch_size = num_updates, batch_size
+        self.num_envs = num_envs
+        self.num_steps = num_steps
+        self.num_batches = num_batches
+        self.num_trials = num_trials
+        self.life_episodes = life_episodes
+        self.num_updates = num_updates
+        self.batch_size = batch_size
         shown = observation_spec["observation"]
         self.autoencoder = Autoencoder(shown.shape.numel(), highest(shown), hidden_size, num_latents)
         self.optimiser = torch.optim.SGD(self.parameters(), lr=learning_rate, momentum=0.9)
@@ -429,12 +438,18 @@ class PennA(TakesNumbers, TensorDictModuleBase):
         lives = self.population.take(who)
         waits = (tensordict["life"] != self.generation) | (tensordict["trial"] == 0)  # for its first episode
         trial = torch.where(waits, 0, tensordict["trial"]) + tensordict["is_init"]
-        weights, outputs = tensordict[WEIGHTS], tensordict[OUTPUTS]
+        weights = tensordict[WEIGHTS]
+        outputs = tensordict[OUTPUTS]
         if waits.any():
             born = lives.weights()
-            weights = born if waits.all() else torch.where(waits.unsqueeze(-1), born, weights)
-            outputs = torch.zeros_like(born[:, 0]) if waits.all() else torch.where(waits, 0.0, outputs)
-        weights, outputs = live(lives, self.autoencoder.inputs(tensordict["observation"]), weights, outputs)
+            if waits.all():  # at the start of a generation, whose individuals may have more neurons
+                weights = born
+                outputs = torch.zeros_like(born[:, 0])
+            else:
+                weights = torch.where(waits.unsqueeze(-1), born, weights)
+                outputs = torch.where(waits, 0.0, outputs)
+        inputs = self.autoencoder.inputs(tensordict["observation"])
+        weights, outputs = live(lives, inputs, weights, outputs)
         output = outputs[:, 0] + NOISE * draw_like(outputs[:, 0])
         action = 2 * (output > THRESHOLD) + 1 * (output < -THRESHOLD)
         tensordict.set("action", guided(tensordict, action))
@@ -474,7 +489,8 @@ class PennA(TakesNumbers, TensorDictModuleBase):
         """
         total = torch.zeros_like(self.rewards[0])
         for _ in range(self.num_updates):
-            loss = self.autoencoder.loss(seen[torch.randint(len(seen), (self.batch_size,), device=seen.device)])
+            drawn = torch.randint(len(seen), (self.batch_size,), device=seen.device)
+            loss = self.autoencoder.loss(seen[drawn])
             minimise(self.optimiser, loss)
             total += loss.detach()
         require_finite("loss_autoencoder", total)

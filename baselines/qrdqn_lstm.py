@@ -37,6 +37,8 @@ class QRDQNLSTM(RecurrentQ):
         """Compute the quantile Huber loss, eq. (10) of the paper with kappa = 1, summed over predicted quantiles."""
         predicted, target = torch.broadcast_tensors(predicted.unsqueeze(-1), target.unsqueeze(-2))
         count = predicted.shape[-2]
-        fractions = (torch.arange(count, dtype=torch.float32, device=predicted.device) + 0.5) / count
-        weight = (fractions.unsqueeze(-1) - (target < predicted).float()).abs()
-        return (weight * huber_loss(predicted, target, reduction="none")).mean(dim=-1).sum(dim=-1)
+        numbers = torch.arange(count, dtype=torch.float32, device=predicted.device)
+        fractions = ((numbers + 0.5) / count).unsqueeze(-1)
+        weight = (fractions - (target < predicted).float()).abs()
+        huber = huber_loss(predicted, target, reduction="none")
+        return (weight * huber).mean(dim=-1).sum(dim=-1)

@@ -22,7 +22,8 @@ Branches = Sequence[tuple[Tensor, Tensor]]
 """Of the histories of each length: which of the one shorter each continues, or which state, and the group of its last
 input; int64 [num_histories] each."""
 
-PREVIOUS_ACTION, REWARD = "previous_action", "reward"
+PREVIOUS_ACTION = "previous_action"
+REWARD = "reward"
 """The keys of an agent's last action and reward."""
 
 

@@ -130,8 +130,11 @@ class SWOKS(Detector):
         points = torch.cat([self.pending.view(-1, new.shape[1]), new])
         full = len(points) // self.window * self.window
         self.pending = points[full:].clone()
-        verdicts = (self._update(window) for window in points[:full].unflatten(0, (-1, self.window)))
-        return next((verdict for verdict in verdicts if verdict is not None), None)
+        for window in points[:full].unflatten(0, (-1, self.window)):
+            verdict = self._update(window)
+            if verdict is not None:
+                return verdict
+        return None
 
     def start_label(self, label: int, trial: bool) -> None:
         """Forget the points that are in no window yet, and the history."""

@@ -29,7 +29,8 @@ def ks_greater(first: ArrayLike, second: ArrayLike) -> float:
     both = np.concatenate([x, y])
     below_x = np.searchsorted(x, both, side="right")
     below_y = np.searchsorted(y, both, side="right")
-    return _exact(len(x), len(y), int((below_x * len(y) - below_y * len(x)).max()))
+    most = (below_x * len(y) - below_y * len(x)).max()
+    return _exact(len(x), len(y), int(most))
 
 
 @lru_cache(maxsize=4096)
@@ -41,8 +42,10 @@ def _exact(m: int, n: int, most: int) -> float:
     """
     after: NDArray[Any] = np.zeros(m + 1)
     for j in range(n, -1, -1):
-        reached = min(max(-(-(most + j * m) // n), 0), m + 1)  # the smallest i that reaches it
-        after = np.append(after[:reached], [math.comb(m - i + n - j, n - j) for i in range(reached, m + 1)])
+        smallest = -(-(most + j * m) // n)  # i that reaches it
+        reached = min(max(smallest, 0), m + 1)
+        all_paths = [math.comb(m - i + n - j, n - j) for i in range(reached, m + 1)]
+        after = np.append(after[:reached], all_paths)
         inside = np.append(after[:reached], after[reached : reached + 1])
         after[:reached] = inside[::-1].cumsum()[::-1][:reached]
     return float(after[0] / math.comb(m + n, n))

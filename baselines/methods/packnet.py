@@ -103,7 +103,8 @@ class PackNet(TaskMethod):
     @torch.no_grad()
     def after_step(self, weights: Sequence[Tensor]) -> None:
         """Undo the optimiser's changes of weights that may not change."""
-        write_flat(torch.where(self.live, flat(weights), torch.where(self.mine, self.packed, 0.0)), weights)
+        fixed = torch.where(self.mine, self.packed, 0.0)
+        write_flat(torch.where(self.live, flat(weights), fixed), weights)
 
     @torch.no_grad()
     def task_weights(self, task: int) -> Tensor | None:
@@ -124,8 +125,8 @@ class PackNet(TaskMethod):
         weights = self.weights.vector()
         kept = torch.zeros_like(self.live)
         share = 1 / (self.num_tasks - self.slot)
-        parts = zip(*(self.weights.split(each) for each in (weights, trained, kept)), strict=True)
-        for parameter, (values, free, keep) in zip(self.weights.parameters, parts, strict=True):
+        parts = [self.weights.split(each) for each in (weights, trained, kept)]
+        for parameter, values, free, keep in zip(self.weights.parameters, *parts, strict=True):
             count = int(free.sum())
             most = count if parameter.ndim < 2 else round(share * count)
             keep[values.abs().masked_fill(~free, -1.0).topk(most).indices] = True

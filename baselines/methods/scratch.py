@@ -25,8 +25,10 @@ class Scratch(TaskMethod):
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`."""
         super().setup(agent, weights, curriculum)
-        layers = [(name, each) for name, each in agent.policy.named_modules() if list(each.parameters(recurse=False))]
-        fixed = [name or type(layer).__name__ for name, layer in layers if not hasattr(layer, "reset_parameters")]
+        fixed = []
+        for name, layer in agent.policy.named_modules():
+            if list(layer.parameters(recurse=False)) and not hasattr(layer, "reset_parameters"):
+                fixed.append(name or type(layer).__name__)
         require((not fixed, f"Scratch draws weights again by reset_parameters, which {', '.join(fixed)} lack: add it"))
         self.register_buffer("kept", weights.zeros().repeat(self.num_tasks, 1))
 

@@ -173,9 +173,8 @@ class QLearner(Learner):
         self.multi_step.done_keys = ()  # so that the end of an episode is known where the target reaches it
         self.prioritized = self.priority_alpha != 0
         size = self.num_items(buffer_size)
-        sampler = (
-            PrioritySampler(size, self.priority_alpha, self.priority_beta) if self.prioritized else RandomSampler()
-        )
+        alpha = self.priority_alpha
+        sampler = PrioritySampler(size, alpha, self.priority_beta) if self.prioritized else RandomSampler()
         storage = LazyTensorStorage(size)
         self.replay = TensorDictReplayBuffer(storage=storage, sampler=sampler, batch_size=batch_size)
 

@@ -67,7 +67,10 @@ class Stack:
         for number, states in enumerate(self._states()):
             for key in states[0]:
                 values = [state[key] for state in states]
-                joined = torch.stack(values).amax(dim=0) if key == "step" else stacked(values)  # 0 of one that failed
+                if key == "step":
+                    joined = torch.stack(values).amax(dim=0)  # 0 of one that failed
+                else:
+                    joined = stacked(values)
                 _keep(self.moments[number], key, joined)
         self.read_others()
 
@@ -83,7 +86,8 @@ class Stack:
         """Write the weights and the optimiser's state to the learners."""
         members = [named_tensors(learner) for learner in self.learners]
         for name in self.learned:
-            torch._foreach_copy_([each[name] for each in members], list(unstacked(self.kept[name]).unbind()))
+            values = list(unstacked(self.kept[name]).unbind())
+            torch._foreach_copy_([each[name] for each in members], values)
         for moments, states in zip(self.moments, self._states(), strict=True):
             for key, value in moments.items():
                 values = [value] * len(states) if key == "step" else list(unstacked(value).unbind())

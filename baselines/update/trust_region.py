@@ -8,8 +8,10 @@ import torch
 from torch import Tensor, nn
 from torch.func import grad, jvp, vjp
 
-CONJUGATE_STEPS, DAMPING = 10, 1e-5
-LINE_SEARCH_STEPS, SHRINKAGE = 15, 0.8
+CONJUGATE_STEPS = 10
+DAMPING = 1e-5
+LINE_SEARCH_STEPS = 15
+SHRINKAGE = 0.8
 
 
 @torch.no_grad()
