@@ -50,12 +50,12 @@ class Symbols:
         banks = {task.images: task.images.bank(0).flatten(1) for task in tasks}
         self.images = torch.cat(list(banks.values())).unique(dim=0)
         paid = {0.0}
-        steps = set()
         for task in tasks:
             paid.update((task.goal_reward, task.fail_reward))
-            steps.add(task.step_reward)
-        every = sorted({reward + step for reward in paid for step in steps})
-        self.rewards = torch.tensor(every, dtype=torch.float32, device="cpu")
+        every: set[float] = set()
+        for step in {task.step_reward for task in tasks}:
+            every.update(reward + step for reward in paid)
+        self.rewards = torch.tensor(sorted(every), dtype=torch.float32, device="cpu")
         self.num_actions = max(task.num_actions for task in tasks)
         self.num_contexts = len(self.images) * self.num_actions
         self.num_pairs = len(self.images) * len(self.rewards)

@@ -132,7 +132,9 @@ class PolicyGradient(Learner):
         self._make_orthogonal()
         state = [key for key in self.trunk.out_keys if key != self.features]
         copied = copied_action(self.trunk.in_keys)
-        keys = [*ACTED_KEYS, *state, *(key for module in copied for key in module.out_keys)]
+        keys = [*ACTED_KEYS, *state]
+        for module in copied:
+            keys += module.out_keys
         self.policy = ActorCritic(self.trunk, self.actor, self.critic, *copied, selected_out_keys=keys)
         self.optimiser = make_optimiser(optimiser, self.parameters(), learning_rate)
 

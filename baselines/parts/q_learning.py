@@ -202,7 +202,9 @@ class QLearner(Learner):
             copied: what `copied_action` returns for the network.
         """
         self.exploration = Exploration(action_spec, *self.eps_range, self.annealing_batches)
-        keys = ["action", *state, *(key for module in copied for key in module.out_keys)]
+        keys = ["action", *state]
+        for module in copied:
+            keys += module.out_keys
         self.policy = EpsilonGreedy(greedy, self.exploration, *copied, selected_out_keys=keys)
         self.set_target_update(objective, age=0)
         self.optimiser = make_optimiser("adam", greedy.parameters(), learning_rate)

@@ -67,10 +67,7 @@ class Stack:
         for number, states in enumerate(self._states()):
             for key in states[0]:
                 values = [state[key] for state in states]
-                if key == "step":
-                    joined = torch.stack(values).amax(dim=0)  # 0 of one that failed
-                else:
-                    joined = stacked(values)
+                joined = torch.stack(values).amax(dim=0) if key == "step" else stacked(values)  # 0 of one that failed
                 _keep(self.moments[number], key, joined)
         self.read_others()
 

@@ -31,6 +31,7 @@ SMALL_METHOD = {
     "clear": ["method.buffer_size=48"],
     "ewc": SAMPLES,
     "ewc_published": SAMPLES,
+    "finetune": ["method.trunk=kept"],  # else the agent is unchanged
     "mas": SAMPLES,
     "mask_amsc": SAMPLES,
     "mask_sc": SAMPLES,
