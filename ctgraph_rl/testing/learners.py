@@ -15,7 +15,7 @@ from ctgraph_rl.learn.lifelong import learn_curriculum
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.saved import sum_of_state
 from ctgraph_rl.runs.train import new_agent, with_method
-from ctgraph_rl.tasks.configurations import ct_su_b1
+from ctgraph_rl.tasks.configurations import ct_graph
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
 
@@ -42,14 +42,15 @@ class AgentContract:
 
         Failing costs, so that every batch has rewards to learn from.
         """
-        tasks = tuple(replace(ct_su_b1(goal=goal), fail_reward=-1.0) for goal in ((1, 1), (2, 2)))
+        first = replace(ct_graph(depth=1, fully_observable=False), fail_reward=-1.0)
+        tasks = (first, replace(first, goal=(2,)))
         shortest = tuple(Block((task,), num_frames=1) for task in tasks)
         curriculum = Curriculum("contract", 1, "a test", shortest, protocol=self.protocol())
         agent = self.make_agent(*agent_specs(curriculum))
         frames = 3 * agent.num_envs * agent.num_steps
         adapt_episodes = getattr(agent, "adapt_episodes", 0)
         blocks = tuple(Block(tasks if adapt_episodes else (task,), frames) for task in tasks)
-        evaluation = Evaluation(num_episodes=2, adapt_episodes=adapt_episodes)
+        evaluation = Evaluation(num_episodes=2, before=False, adapt_episodes=adapt_episodes)
         return replace(curriculum, blocks=blocks, evaluation=evaluation)
 
     def build(self, curriculum: Curriculum, seed: int = 0) -> Agent:

@@ -9,8 +9,8 @@ from baselines.parts.catalogue import catalogue
 from ctgraph_rl import Protocol
 from ctgraph_rl.testing import AgentContract, MethodContract
 
-WHOLE_TRIALS = ["agent.adapt_episodes=1", "agent.num_steps=12", "agent.num_layers=1"]
-"""The two episodes of a trial have at most 12 steps."""
+WHOLE_TRIALS = ["agent.adapt_episodes=1", "agent.num_steps=8", "agent.num_layers=1"]
+"""The two episodes of a trial have at most 8 steps."""
 
 SMALL_AGENT = {
     "maml": WHOLE_TRIALS,
@@ -52,7 +52,7 @@ class TestEveryAgent(AgentContract):
 
 
 class TestEveryMethod(MethodContract):
-    @pytest.fixture(autouse=True, params=others_slow(METHODS, "packnet", "finetune", "multitask"))
+    @pytest.fixture(autouse=True, params=others_slow(METHODS, "packnet", "multitask"))
     def _method(self, request, compose):
         self.name = request.param
         self.make_agent = made(compose, "agent", "a2c", *TINY)

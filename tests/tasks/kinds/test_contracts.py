@@ -36,11 +36,13 @@ class TestPoles(TaskContract, EnvironmentContract):
         return [replace(pole, max_episode_steps=9) for pole in (short, long)]
 
 
+@pytest.mark.slow
 class TestPendulums(TaskContract, EnvironmentContract):
     def make_tasks(self):
         return [GymTask("Pendulum-v1", {"g": gravity}, max_episode_steps=9) for gravity in (5.0, 10.0)]
 
 
+@pytest.mark.slow
 class TestFaceOfGymnasium(TaskContract, EnvironmentContract):
     def make_tasks(self):
         settings = [{"goal": list(goal)} for goal in GOALS]
