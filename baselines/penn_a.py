@@ -43,16 +43,7 @@ from baselines.parts.distinct import distinct
 from baselines.parts.learner import require_finite
 from baselines.parts.networks import Data, TensorsByName, guided, highest, is_greedy, num_actions_of, require_weights
 from baselines.update.update import minimise
-from ctgraph_rl.checks import (
-    NamedValues,
-    ReadOnlyValues,
-    TakesNumbers,
-    at_least_one,
-    fraction,
-    positive,
-    require,
-    require_memory,
-)
+from ctgraph_rl.checks import NamedValues, TakesNumbers, at_least_one, fraction, positive, require, require_memory
 from ctgraph_rl.learn.collect import UNSTORED
 
 PASSES = 5
@@ -359,24 +350,11 @@ class PennA(TakesNumbers, TensorDictModuleBase):
         super().__init__()
         num_actions = num_actions_of(action_spec)
         require(
-            *at_least_one(
-                num_envs=num_envs,
-                num_steps=num_steps,
-                num_batches=num_batches,
-                num_trials=num_trials,
-                life_episodes=life_episodes,
-                num_latents=num_latents,
-                hidden_size=hidden_size,
-                num_updates=num_updates,
-                batch_size=batch_size,
-                segment_size=segment_size,
-            ),
-            *fraction(
-                crossover_prob=crossover_prob,
-                insert_prob=insert_prob,
-                duplicate_prob=duplicate_prob,
-                delete_prob=delete_prob,
-            ),
+            *at_least_one(num_envs=num_envs, num_steps=num_steps, num_batches=num_batches, num_trials=num_trials),
+            *at_least_one(life_episodes=life_episodes, num_latents=num_latents, hidden_size=hidden_size),
+            *at_least_one(num_updates=num_updates, batch_size=batch_size, segment_size=segment_size),
+            *fraction(crossover_prob=crossover_prob, insert_prob=insert_prob),
+            *fraction(duplicate_prob=duplicate_prob, delete_prob=delete_prob),
             *positive(learning_rate=learning_rate, precision=precision),
             (num_actions == 3, f"PENN-A has one neuron for the actions 0, 1 and 2, and the task has {num_actions}"),
         )
@@ -507,7 +485,7 @@ class PennA(TakesNumbers, TensorDictModuleBase):
         state["optimiser"] = self.optimiser.state_dict()
         return state
 
-    def set_extra_state(self, state: ReadOnlyValues) -> None:
+    def set_extra_state(self, state: NamedValues) -> None:
         """Restore what `get_extra_state` returned."""
         self.population = Population(**state["population"])
         self.generation = state["generation"]

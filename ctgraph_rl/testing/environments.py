@@ -175,6 +175,7 @@ class EnvironmentContract(_OfTasks):
         env = self.make_env(tasks)
         other = self.make_env(tasks)
         *_, (_, data) = self.steps(env)
+        env.set_tasks(tasks[::-1], at_episode_end=True)
         other.load_state_dict(env.state_dict())
 
         for _ in range(NUM_STEPS):

@@ -140,20 +140,22 @@ class Miscounts(CTGraphEnv):
 
 
 class Unseeded(CTGraphEnv):
-    """Takes another seed each time."""
+    """Pays what no seed decides."""
 
-    made = 0
+    steps = 0
 
-    def __init__(self, tasks, seed=0, **others):
-        Unseeded.made += 1
-        super().__init__(tasks, seed + Unseeded.made, **others)
+    def _step(self, tensordict):
+        Unseeded.steps += 1
+        data = super()._step(tensordict)
+        return data.set("reward", data["reward"] + Unseeded.steps)
 
 
 class Unsaved(CTGraphEnv):
-    """Loads another number of steps taken."""
+    """Loads another number of steps in the present episodes."""
 
     def load_state_dict(self, state_dict, *args, **kwargs):
-        return super().load_state_dict({**state_dict, "rows.tick": state_dict["rows.tick"] + 1}, *args, **kwargs)
+        count = state_dict["rows.step_count"] + 1
+        return super().load_state_dict({**state_dict, "rows.step_count": count}, *args, **kwargs)
 
 
 @pytest.mark.parametrize(
