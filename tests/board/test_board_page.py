@@ -60,13 +60,16 @@ def test_the_page_names_the_tracks_without_a_line(made):
 def test_what_the_page_says_of_single_lines_holds(made):
     page = (RESULTS / "board.md").read_text(encoding="utf-8")
     alone = {(table.track.name, table.variant.rung): table for table in made if len(table.standings) == 1}
-    deep = [alone["exploration", f"depth {depth}"] for depth in (5, 6)]
-
-    assert "all ten seeds learn to reach the goals of depth 5 and 6 in 102,400 frames" in page
-    assert {table.standings[0].entry.scores for table in deep} == {(1.0,) * 10}
+    deep = [alone["exploration", f"depth {depth}"] for depth in (5, 6, 7, 8)]
+    reached = (
+        "ten seeds of ten reach the goals of depth 5 and 6 after 102,400 frames, four that of depth 7 and none that"
+    )
+    assert f"{reached} of depth 8" in page
+    assert [table.standings[0].entry.scores.count(1.0) for table in deep] == [10, 10, 4, 0]
+    assert [table.standings[0].entry.scores.count(0.0) for table in deep] == [0, 0, 6, 10]
     assert {table.variant.curriculum.num_frames for table in deep} == {102_400}
-    needed = " and ".join(f"{table.ceilings.random_frames:,.0f}" for table in deep)
-    assert f"A random policy needs {needed} for its first reward" in page
+    needed = f"{deep[1].ceilings.random_frames:,.0f}"
+    assert f"A random policy needs {needed} for its first reward at depth 6" in page
 
     kept = alone["forgetting", ""].standings[0].entry
     assert "learns 76 of 80 tasks, all eight in seven of ten seeds, and forgets none" in page

@@ -12,7 +12,6 @@ from ctgraph_rl.board.method_yaml import OURS
 from ctgraph_rl.board.standings.board_formats import columns
 from ctgraph_rl.board.standings.board_page import write_board
 from ctgraph_rl.board.standings.board_tables import BoardTable
-from ctgraph_rl.board.standings.entries import shown_level
 from ctgraph_rl.board.standings.track_ceilings import Ceilings
 from studies.raw import HERE, TEMPLATES, table
 
@@ -143,16 +142,13 @@ def page(tables: list[BoardTable]) -> str:
     """Return the page: its template with its tables."""
     several = [each for each in tables if len(each.standings) > 1]
     alone = [each for each in tables if len(each.standings) == 1]
-    lines = [line for each in tables for line in each.standings]
-    levels = [shown_level(line.entry.level) for line in lines]
     template = Template((TEMPLATES / "board.md").read_text(encoding="utf-8"))
     return template.substitute(
         tables="\n\n".join(f"## {each.title}\n\n{_table(each)}" for each in several),
         alone=table(
             ["track and rung", "given", "method", "score", "bytes per task", "landmarks"], list(map(_line, alone))
         ),
-        levels=", ".join(f"{levels.count(level)} {level}" for level in dict.fromkeys(levels)),
-        count=len(lines),
+        count=sum(len(each.standings) for each in tables),
         without=_without({each.track.name for each in tables}),
     )
 
@@ -166,9 +162,13 @@ def _without(there: set[str]) -> str:
 
 
 def _table(of: BoardTable) -> str:
-    lines = [[cell for cell in columns(line) if cell.head not in ELSEWHERE] for line in of.standings]
-    rows = [[f"{cell.shown} {cell.interval}".strip() for cell in cells] for cells in lines]
-    return table([cell.head for cell in lines[0]], rows)
+    rows = []
+    for line in of.standings:
+        cells = [cell for cell in columns(line) if cell.head not in ELSEWHERE]
+        rank, *others = cells
+        shown = [f"{cell.shown} {cell.interval}".strip() for cell in others]
+        rows.append([rank.shown.replace(" to ", "-"), *shown])
+    return table([cell.head for cell in cells], rows)
 
 
 def _line(of: BoardTable) -> list[str]:
