@@ -97,7 +97,8 @@ def _known(line: Line) -> str:
     """Return the optimum and what random actions have, where they are known."""
     if not line["optimum"]:
         return ""
-    return f" The optimum is {float(line['optimum']):.3g}; random actions have {float(line['random']):.2g}."
+    best = "With a known goal the optimum is" if line["agent"] == "rl2" else "The optimum is"
+    return f" {best} {float(line['optimum']):.3g}; random actions have {float(line['random']):.2g}."
 
 
 def draw_curves(curriculum: Curriculum, path: Path) -> None:
