@@ -56,6 +56,15 @@ def test_one_soft_gate_almost_never_finds_the_goal():
     assert [fmean(curve) < 0.01 for curve in curves("cavia", "soft")].count(True) == 1
 
 
+def test_pearl_ends_lower_with_a_gate_that_learns_in_each_of_three_seeds():
+    found = adaptation.runs(2)
+    without = found["pearl", "none"]
+    gated = found["pearl", "hard_straight_through"]
+
+    assert len(gated) == 3
+    assert all(adaptation.adapted(lines) < adaptation.adapted(without[seed]) for seed, lines in gated.items())
+
+
 def test_the_best_search_for_a_swapped_goal_is_what_playing_it_gives():
     """Goals 0 to 3 in turn; after a miss of a known goal, the others in turn."""
     misses = []
