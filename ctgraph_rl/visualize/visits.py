@@ -23,9 +23,9 @@ from ctgraph_rl.visualize.states import Key
 class Visits(NamedTuple):
     """Counts over a number of episodes, by (state type, node); home and fail have node 0."""
 
-    counts: dict[Key, int]
+    counts: dict[tuple[StateType, int], int]
     """Steps that began in a home, wait or decision state, and episodes that ended in an end state or in fail."""
-    actions: dict[Key, list[float]]
+    actions: dict[tuple[StateType, int], list[float]]
     """The share of each action in home, wait and decision states; those above b are of other tasks, and fail."""
 
 
