@@ -125,7 +125,7 @@ def learner(compose, tmp_path):
 
 
 def has_reward(state: Path) -> bool:
-    """Whether an agent that reads its last reward, such as RL^2, reads one that is not 0 when it goes on."""
+    """Whether a last reward that is not 0 is saved. RL^2 reads it."""
     carried = decoded(state)["carried"]
     return "reward" in carried and bool(carried["reward"].any())
 
