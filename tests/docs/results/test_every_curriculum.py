@@ -75,3 +75,13 @@ def test_random_actions_have_what_the_closed_form_says(name):
     found = float(known_values(curriculum)["random"])
 
     assert found > 2 * exact if name == "fo_b2_gradient" else found == pytest.approx(float(exact), rel=1e-3)
+
+
+@pytest.mark.parametrize("name", ["fo_b2_gradient", "co_b1_new_waits", "frozen_lake_4maps"])
+def test_lines_have_what_is_known_of_their_curriculum(name):
+    exact = known_values(curricula.load(name))
+    lines = [line for line in LINES if line["curriculum"] == name]
+
+    assert lines
+    assert all({key: line[key] for key in exact} == exact for line in lines)
+    assert exact["optimum"] == ("" if name == "frozen_lake_4maps" else "1")
