@@ -12,7 +12,6 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
-from torch.func import functional_call
 from torchrl.data import Composite, TensorSpec
 from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss
@@ -104,7 +103,7 @@ class DQN(QLearner):
         after = {key: batch["next", key] for key in self.greedy.in_keys}
         predicted = self.values(batch).gather(-1, batch["action"].unsqueeze(-1)).squeeze(-1)
         with torch.no_grad():
-            later = self._target_values(after, self.other_weights() if others is None else others)
+            later = self.with_others(others, DQN.values, after)
             best = (self.values(after) if self.dqn.double_dqn else later).argmax(dim=-1, keepdim=True)
             gamma = later.new_tensor(self.gamma) ** batch["steps_to_next_obs"].view_as(batch["next", "reward"])
             running = (~batch["next", "terminated"]).int()
@@ -118,22 +117,3 @@ class DQN(QLearner):
         """Compute the online network's action values."""
         trunk, head = self.greedy.module[0].module
         return head.module(trunk.over_time(data))
-
-    def _target_values(self, data: Data, weights: Data) -> Tensor:
-        """Compute the target network's action values."""
-        trunk, head = self.greedy.module[0].module
-        parts: list[TensorsByName] = [{}, {}]
-        for name, value in weights.items():
-            part, _, name = name.partition(".")
-            parts[int(part)][name] = value
-        features = functional_call(trunk.module, parts[0], tuple(data[key] for key in trunk.in_keys))
-        return functional_call(head.module, parts[1], (features,))
-
-    def other_weights(self) -> TensorsByName:
-        """Return the target network's weights: those of its trunk as ``0.*``, those of its head as ``1.*``."""
-        found = {}
-        for place in ("0", "1"):
-            part = self.dqn.target_value_network_params["module", "0", "module", place, "module"]
-            for name, value in part.flatten_keys(".").items():
-                found[f"{place}.{name}"] = value
-        return found

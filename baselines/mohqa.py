@@ -196,21 +196,6 @@ class ModulatedGreedy(TensorDictModuleBase):
         return self.noise_std * torch.randn_like(features) * (torch.rand_like(features) < self.noise_share)
 
 
-class Target(WithTarget):
-    """A Q-network and its target network.
-
-    Args:
-        network: a sequence of trunk and head.
-    """
-
-    def outputs(self, data: Data) -> tuple[Tensor, Tensor]:
-        """Compute phi and q with the target network's weights."""
-        trunk, head = self.value_network
-        with self.target_value_network_params.to_module(self.value_network, preserve_module_state=False):
-            features = trunk.over_time(data)
-            return features, head.module(features)
-
-
 class MOHQA(QLearner):
     """A Q-network with a modulated Hebbian network beside it.
 
@@ -292,7 +277,7 @@ class MOHQA(QLearner):
         self.register_buffer("target_weights", self.hebbian.weights.clone())
         self.register_buffer("average", torch.zeros(num_features, dtype=torch.float32, device="cpu"))
         self.greedy = network = TensorDictSequential(trunk, head)
-        self.target = Target(network)
+        self.target = WithTarget(network)
         self.set_networks(network, self.target, action_spec, learning_rate)
         self.policy = ModulatedGreedy(
             trunk,
@@ -317,6 +302,10 @@ class MOHQA(QLearner):
         super().reset_parameters()
         self.hebbian.weights.zero_()
         self.average.zero_()
+
+    def other_weights(self) -> TensorsByName:
+        """Return all weights of the target network."""
+        return {**super().other_weights(), "hebbian.weights": self.target_weights}
 
     def weights_changed(self) -> None:
         """Copy all weights to the target network."""
@@ -353,14 +342,13 @@ class MOHQA(QLearner):
         after = [("next", key) for key in (*seen, "reward", "terminated")]
         return batch.select(*seen, "action", *after, "steps_to_next_obs").reshape(-1)
 
-    def loss(self, batch: Data) -> TensorsByName:
+    def loss(self, batch: Data, others: Data | None = None) -> TensorsByName:
         """Compute the mean squared error of the value of the action taken; the targets are those of q' + u'."""
         values = self.values(batch) if self.predict_sum else self.policy.head(self.policy.features(batch))
         predicted = values.gather(-1, batch["action"].unsqueeze(-1))
+        after = {key: batch["next", key] for key in (*self.policy.greedy.in_keys, "average")}
         with torch.no_grad():
-            features, later = self.target.outputs({key: batch["next", key] for key in self.policy.greedy.in_keys})
-            y = (features - batch["next", "average"]).tanh()
-            best = (later + nn.functional.linear(y, self.target_weights).sigmoid()).amax(dim=-1, keepdim=True)
+            best = self.with_others(others, MOHQA.values, after).amax(dim=-1, keepdim=True)
             gamma = best.new_tensor(self.gamma) ** batch["steps_to_next_obs"].view_as(best)
             target = batch["next", "reward"] + gamma * ~batch["next", "terminated"] * best
         return {"loss_value": (predicted - target).square().mean()}

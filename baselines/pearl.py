@@ -274,7 +274,11 @@ class PEARL(Learner):
         step = (first + (share * (last + 1 - first)).long()).minimum(last)
         return {key: value[row, step] for key, value in self.replay.items() if key != "begins"}
 
-    def loss(self, batch: Data) -> TensorsByName:
+    def other_weights(self) -> TensorsByName:
+        """Return the target critics' weights."""
+        return {f"critics.{name}": value for name, value in self.targets.named_parameters()}
+
+    def loss(self, batch: Data, others: Data | None = None) -> TensorsByName:
         """Compute the losses of what `minibatches` yields."""
         mean, variance = self.posterior(batch)
         context = (mean + variance.sqrt() * batch["noise"]).unsqueeze(1).expand(-1, batch["action"].shape[1], -1)
@@ -283,11 +287,11 @@ class PEARL(Learner):
         after = tuple(batch["next", key] for key in self.specs)
         with torch.no_grad():
             later = self.policy.actor(*after, fixed).log_softmax(dim=-1)
-            soft = smaller(self.targets, after, fixed) - self.entropy_coeff * later
+            soft = self.with_others(others, PEARL.smaller, after, fixed) - self.entropy_coeff * later
             value = (later.exp() * soft).sum(dim=-1, keepdim=True)
             reward = self.reward_scale * batch["next", "reward"]
             target = reward + self.gamma * ~batch["next", "terminated"] * value
-            best = smaller(self.critics, seen, fixed)
+            best = self.smaller(seen, fixed)
         action = batch["action"].unsqueeze(-1)
         errors = [critic(*seen, context).gather(-1, action) - target for critic in self.critics]
         log_probs = self.policy.actor(*seen, fixed).log_softmax(dim=-1)
@@ -297,6 +301,11 @@ class PEARL(Learner):
             "loss_context": self.kl_coeff * kl_to_prior(mean, variance).mean(),
             "entropy": entropy(log_probs).detach().mean(),
         }
+
+    def smaller(self, seen: NetInputs, context: Tensor) -> Tensor:
+        """Compute the smaller of the critics' action values, [..., num_actions]."""
+        first, second = (critic(*seen, context) for critic in self.critics)
+        return torch.minimum(first, second)
 
     def posterior(self, batch: Data) -> tuple[Tensor, Tensor]:
         """Compute mu and s of the contexts of a minibatch, [num_trials, num_context] each."""
@@ -324,9 +333,3 @@ class PEARL(Learner):
         """Restore what `get_extra_state` returned."""
         super().set_extra_state(state)
         self.replay = state["replay"]
-
-
-def smaller(critics: nn.ModuleList, seen: NetInputs, context: Tensor) -> Tensor:
-    """Compute the smaller of the critics' action values, [..., num_actions]."""
-    first, second = (critic(*seen, context) for critic in critics)
-    return torch.minimum(first, second)

@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from torch.func import functional_call
 
 from baselines.parts.hooks import Hooks
 from baselines.parts.networks import Data, Items, TensorsByName
@@ -113,7 +114,7 @@ class Learner(TakesNumbers, nn.Module):
         return False
 
     def other_weights(self) -> TensorsByName:
-        """Return the tensors beside parameters and buffers that the losses read, such as those of a target network."""
+        """Return what the losses read in place of the learner's own tensors, by their names: a target network's."""
         return {}
 
     def num_learnt(self, batch: TensorDictBase) -> int:
@@ -173,6 +174,11 @@ class Learner(TakesNumbers, nn.Module):
     def forward(self, function: Callable[..., Any], *given: Any) -> Any:
         """Return a function of this learner: with the tensors that `torch.func.functional_call` gives it."""
         return function(self, *given)
+
+    def with_others(self, others: Data | None, function: Callable[..., Any], *given: Any) -> Any:
+        """Return a function of this learner with other tensors, by name; None: those of `other_weights`."""
+        found = self.other_weights() if others is None else others
+        return functional_call(self, dict(found), (function, *given), tie_weights=False)
 
     def gradient_step(self, batch: Data) -> TensorsByName:
         """Minimise the sum of the losses of a batch by one step; return losses and gradient norm."""

@@ -237,6 +237,11 @@ class QLearner(Learner):
         if self.replay_on_task_change == "clear":
             self.replay.empty()
 
+    def other_weights(self) -> TensorsByName:
+        """Return the target network's weights."""
+        kept = self.target_update.loss_module.target_value_network_params
+        return {f"greedy.{name}": value for name, value in kept.flatten_keys(".").items()}
+
     def weights_changed(self) -> None:
         """Copy the weights to the target network."""
         self.target_update.counter = self.target_update.value_network_update_interval

@@ -44,36 +44,6 @@ class Quantiles(nn.Module):
         return quantiles.mean(dim=-1), quantiles
 
 
-class RecurrentTargets(WithTarget):
-    """Computes the predicted quantiles of the actions taken, and their targets.
-
-    Args:
-        network: reads sequences, writes ``quantiles`` [B, L, A, K].
-    """
-
-    def forward(self, batch: Data) -> tuple[Tensor, Tensor]:
-        """Compute both, [B, L, K]; where ``learnt`` is False, they mean nothing.
-
-        The target is the multi-step reward plus the target network's quantiles of the action that the online network
-        finds best at the step where the rewards end.
-        """
-        online = self._quantiles(self.value_network_params, batch)
-        with torch.no_grad():
-            later = self._quantiles(self.target_value_network_params, batch)
-        best = of_action(later, online.mean(dim=-1).argmax(dim=-1))
-        steps = best.shape[1]
-        positions = torch.arange(steps, device=best.device) + batch["steps_to_next_obs"]
-        positions = positions.clamp(max=steps - 1).unsqueeze(-1).expand_as(best)
-        bootstrap = batch["gamma"].unsqueeze(-1) * best.gather(1, positions)
-        target = batch["next", "reward"] + torch.where(batch["next", "terminated"], 0.0, bootstrap)
-        return of_action(online, batch["action"]), target
-
-    def _quantiles(self, params: TensorDictBase, batch: Data) -> Tensor:
-        trunk, head = self.value_network.module[0].module
-        with params.to_module(self.value_network, preserve_module_state=False):
-            return head.module(trunk.over_time(batch))[1]
-
-
 def of_action(quantiles: Tensor, action: Tensor) -> Tensor:
     """Select the quantiles [B, L, K] of one action at every step, from [B, L, A, K] and [B, L]."""
     index = action[..., None, None].expand(*action.shape, 1, quantiles.shape[-1])
@@ -128,15 +98,22 @@ class RecurrentQ(QLearner):
         self.greedy = QValueActor(
             TensorDictSequential(self.trunk, values), in_keys=self.trunk.in_keys, spec=action_spec
         )
-        self.targets = RecurrentTargets(self.greedy)
+        self.targets = WithTarget(self.greedy)
         state = self.trunk.out_keys[1:]
         copied = copied_action(self.trunk.in_keys)
         self.set_networks(self.greedy, self.targets, action_spec, learning_rate, *state, copied=copied)
 
     def values(self, data: Data) -> Tensor:
-        """Compute the means of the online network's quantiles."""
+        """Compute the means of the network's quantiles."""
+        return self._head(data)[0]
+
+    def quantiles(self, data: Data) -> Tensor:
+        """Compute the network's quantiles, [B, L, A, K]."""
+        return self._head(data)[1]
+
+    def _head(self, data: Data) -> tuple[Tensor, Tensor]:
         head = self.greedy.module[0].module[1]
-        return head.module(self.trunk.over_time(data))[0]
+        return head.module(self.trunk.over_time(data))
 
     def num_items(self, num_steps: int) -> int:
         """Return the number of sequences."""
@@ -168,8 +145,21 @@ class RecurrentQ(QLearner):
         """Compute the loss of every step, [B, L], from quantiles [B, L, K]."""
         raise NotImplementedError
 
-    def loss(self, batch: Data) -> TensorsByName:
-        """Compute the mean loss of the steps of sequences."""
-        distance = self.distance(*self.targets(batch))
+    def loss(self, batch: Data, others: Data | None = None) -> TensorsByName:
+        """Compute the mean loss of the steps of sequences.
+
+        The target is the multi-step reward plus the target network's quantiles of the action that the online network
+        finds best at the step where the rewards end. Where ``learnt`` is False, it means nothing.
+        """
+        online = self.quantiles(batch)
+        with torch.no_grad():
+            later = self.with_others(others, RecurrentQ.quantiles, batch)
+        best = of_action(later, online.mean(dim=-1).argmax(dim=-1))
+        steps = best.shape[1]
+        positions = torch.arange(steps, device=best.device) + batch["steps_to_next_obs"]
+        positions = positions.clamp(max=steps - 1).unsqueeze(-1).expand_as(best)
+        bootstrap = batch["gamma"].unsqueeze(-1) * best.gather(1, positions)
+        target = batch["next", "reward"] + torch.where(batch["next", "terminated"], 0.0, bootstrap)
+        distance = self.distance(of_action(online, batch["action"]), target)
         learnt = batch["learnt"]
         return {"loss_value": (distance * learnt).sum() / learnt.sum().clamp(min=1)}

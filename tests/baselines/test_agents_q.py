@@ -10,6 +10,7 @@ from torchrl.envs.utils import set_exploration_type
 from torchrl.modules import set_recurrent_mode
 
 from baselines.parts.prioritized import PrioritySampler
+from baselines.parts.recurrent_q import RecurrentQ
 from baselines.qrdqn_lstm import QRDQNLSTM
 from ctgraph_rl import CTGraphEnv, evaluate
 from ctgraph_rl.core.dynamics import OUTCOME_GOAL
@@ -204,12 +205,16 @@ def test_nothing_is_remembered_from_one_episode_to_the_next_in_a_sequence(small_
     assert (difference[~same_episode] == 0).all()
 
 
-def test_recurrent_targets_are_those_by_hand(small_agent):
+def test_recurrent_targets_are_those_by_hand(small_agent, monkeypatch):
     agent = small_agent("drqn", [ct_su_b1()])
     online = torch.tensor([[[1.0, 0.0], [0.0, 2.0], [5.0, 4.0], [0.0, 1.0]]]).unsqueeze(-1)
     later = torch.tensor([[[9.0, 9.0], [9.0, 9.0], [6.0, 9.0], [9.0, 8.0]]]).unsqueeze(-1)
-    of = {id(agent.targets.value_network_params): online, id(agent.targets.target_value_network_params): later}
-    agent.targets._quantiles = lambda params, batch: of[id(params)]
+    agent.targets.target_value_network_params.data.zero_()
+    head = agent.greedy.module[0].module[1].module
+    monkeypatch.setattr(RecurrentQ, "quantiles", lambda self, batch: online if head.linear.weight.any() else later)
+    given = []
+    distance = agent.distance
+    monkeypatch.setattr(agent, "distance", lambda *each: given.append(each) or distance(*each))
     batch = TensorDict(
         {
             "action": torch.tensor([[0, 1, 0, 0]]),
@@ -224,12 +229,13 @@ def test_recurrent_targets_are_those_by_hand(small_agent):
         batch_size=[1, 4],
     )
 
-    predicted, target = agent.targets(batch)
+    loss = agent.loss(batch)["loss_value"].item()
 
+    [(predicted, target)] = given
     # Two steps on, action 0 is the online network's best: 0.5 + 0.25 * 6. An end: 1. One step on, action 1: 0.5 * 8.
     assert predicted.flatten().tolist() == [1, 2, 5, 0]
     assert target.flatten().tolist()[:3] == [2, 1, 4]
-    assert agent.loss(batch)["loss_value"].item() == pytest.approx((1 + 1 + 1) / 3)
+    assert loss == pytest.approx((1 + 1 + 1) / 3)
 
 
 def test_a_step_before_a_truncation_is_not_learned_from_and_one_before_a_terminal_state_is(small_agent):
