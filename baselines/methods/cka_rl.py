@@ -41,6 +41,7 @@ class CKARL(TaskMethod):
         alpha_rate: learning rate of alpha by that of the agent, exact for Adam and RMSprop.
     """
 
+    stackable = of_one_seed = True
     counts = ("ended", "num_pooled")
     agent_members = (*TaskMethod.agent_members, "replace_optimiser")
 

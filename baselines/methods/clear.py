@@ -79,6 +79,7 @@ class CLEAR(Method):
         value_coeff: weight of the values' cloning loss.
     """
 
+    acts_on_batches = stackable = True
     needs_boundaries = False
     agent_members = (*Method.agent_members, "memory", "outputs", "output_keys")
 

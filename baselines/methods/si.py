@@ -32,6 +32,9 @@ class SI(Importance):
         settings: the arguments of `Importance`; ``coeff`` is the paper's c.
     """
 
+    stackable = of_one_seed = True
+    step_buffers = ("path", "before", "slope")
+
     path: Tensor  # v, float32 [P]
     start: Tensor  # weights at the start of the task, float32 [P]
     before: Tensor  # weights before a step, float32 [P]

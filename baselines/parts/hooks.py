@@ -18,7 +18,17 @@ class Hooks(nn.Module):
     """
 
     stackable: ClassVar[bool] = True
-    """Whether the hooks take tensors with the seeds as a leading dimension, see `baselines.update.seeds`."""
+    """Whether several seeds can share a gradient step, see `baselines.update.seeds`."""
+
+    of_one_seed: ClassVar[bool] = False
+    """Whether `transform_gradients` and `after_step` take one seed's tensors, and are vectorised for several; else they
+    take those of several, too, with the seeds as a leading dimension."""
+
+    acts_on_batches: ClassVar[bool] = False
+    """Whether it draws or writes weights outside steps and boundaries, which seeds on a GPU cannot follow."""
+
+    step_buffers: ClassVar[tuple[str, ...]] = ()
+    """Names of the buffers that the hooks of a step write."""
 
     def network_weights(self, trained: list[nn.Parameter]) -> list[nn.Parameter]:
         """Return the parameters by which the agent's losses are differentiated, given what its optimiser trains."""

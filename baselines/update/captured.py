@@ -38,6 +38,8 @@ def why_not_captured(agent: Agent) -> str | None:
         return f"{name} cannot be vectorised over seeds on a GPU"
     if any(getattr(type(learner), own) is not getattr(PolicyGradient, own) for own in AS_EVER):
         return f"{name} does not learn by the steps that a batch of seeds shares"
+    if learner.method.acts_on_batches:
+        return f"{type(learner.method).__name__} cannot be vectorised over seeds on a GPU: it acts on batches"
     return why_not_step(learner)
 
 

@@ -191,8 +191,9 @@ class SeedGroup:
                 with self.random(number):
                     measured.append(or_error(agent.learn, part))
             return measured
-        for method, part in zip(self.methods, parts, strict=False):
-            method.on_batch(part)
+        for number, (method, part) in enumerate(zip(self.methods, parts, strict=False)):
+            with self.random(number):
+                method.on_batch(part)
         for stack in self.stacks:
             numbers = range(len(measured), len(measured) + len(stack.learners))
             measured += self._learn_at_once(stack, numbers, parts)

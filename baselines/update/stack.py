@@ -50,6 +50,7 @@ class Stack:
         self.weights = [names[id(tensor)] for tensor in first.weights]
         self.trained = [names[id(tensor)] for tensor in first.trainable]
         self.learned = {*self.weights, *self.trained}
+        self.written = {*self.learned, *(f"method.{name}" for name in first.method.step_buffers)}
         self.kept: TensorsByName = {}
         self.moments: list[TensorsByName] = [{} for _ in self.trained]
         self.others: TensorsByName = {}
@@ -80,10 +81,11 @@ class Stack:
 
     @torch.no_grad()
     def write(self) -> None:
-        """Write the weights and the optimiser's state to the learners."""
+        """Write what a step changes to the learners: weights, buffers of methods, the optimiser's state."""
         members = [named_tensors(learner) for learner in self.learners]
-        for name in self.learned:
-            values = list(unstacked(self.kept[name]).unbind())
+        for name in self.written:
+            value = self.kept[name]
+            values = list((unstacked(value) if name in self.turned else value).unbind())
             torch._foreach_copy_([each[name] for each in members], values)
         for moments, states in zip(self.moments, self._states(), strict=True):
             for key, value in moments.items():

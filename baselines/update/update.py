@@ -135,15 +135,36 @@ def _descend(learner: Learner, weights: Sequence[Tensor], state: UpdateState, gr
     is_stacked = state.tensors is not None
     if is_stacked:
         gradients = [unstacked(gradient) for gradient in gradients]
-    gradients = learner.method.transform_gradients(gradients, weights)
+    gradients = transformed(learner, weights, state, gradients)
     if is_stacked:
         gradients = [unstacked(gradient).contiguous() for gradient in gradients]
     norm = norm_of(gradients, num_leading=int(is_stacked))
     scale = (learner.max_grad_norm / (norm + 1e-6)).clamp(max=1.0)
     with torch.no_grad():
         step(state.optimiser, [gradient * (beside(scale, gradient) if is_stacked else scale) for gradient in gradients])
-    learner.method.after_step(weights)
+    if is_stacked and learner.method.of_one_seed:
+        over_seeds(learner, _after_step, state)
+    else:
+        _after_step(learner, weights)
     return norm
+
+
+def transformed(
+    learner: Learner, weights: Sequence[Tensor], state: UpdateState, gradients: Sequence[Tensor]
+) -> Sequence[Tensor]:
+    """Return the gradients of what is trained, given those of the weights."""
+    if state.tensors is not None and learner.method.of_one_seed:
+        return over_seeds(learner, _transformed, state, gradients)
+    return _transformed(learner, weights, gradients)
+
+
+def _transformed(learner: Learner, weights: Sequence[Tensor], gradients: Sequence[Tensor]) -> Sequence[Tensor]:
+    return learner.method.transform_gradients(gradients, weights)
+
+
+def _after_step(learner: Learner, weights: Sequence[Tensor]) -> tuple[()]:
+    learner.method.after_step(weights)
+    return ()  # seeds are vectorised over what returns tensors, or none of them
 
 
 def norm_of(gradients: Sequence[Tensor], num_leading: int = 0) -> Tensor:

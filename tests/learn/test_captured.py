@@ -133,7 +133,7 @@ def test_neither_acting_nor_learning_needs_the_host(name, compose, captured, swa
         ("a2c", ()),
         ("lstm_ppo", ()),
         ("lstm_ppo", ("cell=gru",)),
-        *(("ppo", (f"method={method}",)) for method in ("scratch", "l2", "ewc", "mas", "mask_ri", "mask_lc")),
+        *(("ppo", (f"method={method}",)) for method in ("scratch", "l2", "ewc", "si", "cka_rl", "mask_lc")),
         ("lstm_ppo", ("method=mask_blc",)),
     ],
 )

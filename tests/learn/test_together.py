@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +19,7 @@ from helpers.small_agents import BATCHED, TINY, others_slow, saved_and_loaded
 from baselines.update import seeds as together
 from baselines.update.seeds import SeedGroup
 from baselines.update.stack import Stack
-from baselines.update.update import losses_of, total_loss, unstacked, update, with_tensors
+from baselines.update.update import losses_of, total_loss, transformed, unstacked, update, with_tensors
 from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, learn_curriculum
 from ctgraph_rl.learn.stacked import learn_together, why_not_together
 from ctgraph_rl.runs.config import target
@@ -28,7 +30,9 @@ SEEDS = (0, 3, 8)
 
 COMPILED = [("ppo", "scratch"), ("prioritized dqn", "finetune")]
 
-METHODS = ("scratch", "l2", "ewc", "ewc_published", "mas", "mask_ri", "mask_lc", "mask_blc")
+ALSO = ("si", "packnet", "clear", "cka_rl")
+
+METHODS = ("scratch", "l2", "ewc", "ewc_published", "mas", "mask_ri", "mask_lc", "mask_blc", *ALSO)
 
 EACH = [*((name, "finetune") for name in BATCHED), *(("ppo", method) for method in METHODS)]
 
@@ -162,17 +166,14 @@ def of_all(group: SeedGroup, minibatches) -> tuple[dict[str, torch.Tensor], list
     batch = {key: torch.stack([wide(each[key]) for each in minibatches]) for key in minibatches[0]}
     losses = losses_of(first, state, batch)
     gradients = list(map(unstacked, torch.autograd.grad(total_loss(losses).sum(), state.weights)))
-    return losses, with_tensors(first, state, transformed, gradients)
+    return losses, list(with_tensors(first, state, transformed, state, gradients))
 
 
 def of_one(learner, minibatch) -> tuple[dict[str, torch.Tensor], list[torch.Tensor]]:
     batch = {key: wide(value) for key, value in minibatch.items()}
     losses = learner.losses(batch, learner.weights, learner.other_weights())
-    return losses, transformed(learner, learner.weights, torch.autograd.grad(total_loss(losses), learner.weights))
-
-
-def transformed(learner, weights, gradients) -> list[torch.Tensor]:
-    return list(learner.method.transform_gradients(gradients, weights))
+    gradients = torch.autograd.grad(total_loss(losses), learner.weights)
+    return losses, list(learner.method.transform_gradients(gradients, learner.weights))
 
 
 def wide(value: torch.Tensor) -> torch.Tensor:
@@ -191,6 +192,38 @@ def test_each_seed_ends_near_its_run_alone(make, name, method):
         assert [line.keys() for line in lines(log)] == [line.keys() for line in lines(its_log)]
         assert agent.state_dict().keys() == alone.state_dict().keys()
         assert first_training(log) == pytest.approx(first_training(its_log), rel=1e-4, abs=1e-5, nan_ok=True)
+
+
+@pytest.mark.parametrize("method", others_slow(ALSO, "si"))
+def test_a_batch_changes_weights_and_what_a_method_keeps_as_in_a_run_alone(make, monkeypatch, method):
+    its, compared, learn = make("ppo", method, curriculum=LESS_EVALUATED), [], SeedGroup.learn
+
+    def checked(group, batch):
+        copies = deepcopy(group.agents)
+        alone = []
+        for number, part in enumerate(batch.chunk(len(copies))):
+            with random_as(group.generators[number]):
+                copies[number].learn(part)
+            alone.append(copies[number].state_dict())
+        measured = learn(group, batch)
+        for agent, expected in zip(group.agents, alone, strict=True):
+            torch.testing.assert_close(agent.state_dict(), expected, rtol=1e-3, atol=1e-4)
+        compared.append(len(alone))
+        return measured
+
+    monkeypatch.setattr(SeedGroup, "learn", checked)
+    its.learn()
+
+    assert compared == [3] * 6
+
+
+@contextmanager
+def random_as(generator: torch.Generator) -> Iterator[None]:
+    """Torch's global generator in the state of another, which stays where it is."""
+    before = torch.get_rng_state()
+    torch.set_rng_state(generator.get_state())
+    yield
+    torch.set_rng_state(before)
 
 
 @pytest.mark.slow
@@ -375,9 +408,8 @@ def test_what_cannot_be_one_batch_says_why(compose):
         return together.why_not_together(new_agent(CURRICULUM, make_agent, 0))
 
     assert reason("lstm_ppo", "finetune") == "LSTMPPO cannot be vectorised over seeds"
-    assert reason("ppo", "packnet") == "PackNet cannot be vectorised over seeds: its hooks take the weights of one seed"
     assert str(reason("ppo", "mask_amsc")).startswith("MaskAMSC cannot be vectorised over seeds: ")
-    assert reason("dqn") is reason("ppo", "mask_lc") is None
+    assert reason("dqn") is reason("ppo", "mask_lc") is reason("ppo", "packnet") is None
     switching = of(Block((ONE, TWO), 96, ByEpisode(2, together=True)), boundaries="hidden")
     assert why_not_together(switching) == "its blocks change the tasks of all rows at once"
     assert why_not_together(CURRICULUM) is None

@@ -144,7 +144,7 @@ def test_what_a_method_draws_at_a_boundary_follows_from_the_counter_of_its_seed(
             ("a2c", ()),
             ("a2c", ("agent.normalize_advantage=true", "method=ewc")),
             ("lstm_ppo", ()),
-            *(("ppo", (f"method={method}",)) for method in ("scratch", "l2", "ewc", "mas", "mask_ri")),
+            *(("ppo", (f"method={method}",)) for method in ("scratch", "l2", "ewc", "si", "mask_ri")),
             ("lstm_ppo", ("method=mask_lc",)),
         ],
         ("a2c", ("agent.normalize_advantage=true", "method=ewc")),
@@ -285,10 +285,11 @@ def test_what_cannot_be_captured_for_all_seeds_says_why(compose):
         return why_agents_learn_alone(agent, GPU)
 
     assert reason("dqn") == "DQN cannot be vectorised over seeds on a GPU"
-    assert reason("ppo", "si") == "SI cannot be vectorised over seeds: its hooks take the weights of one seed"
+    assert reason("ppo", "packnet") == "PackNet cannot be vectorised over seeds on a GPU: it acts on batches"
+    assert str(reason("ppo", "mask_sc")).endswith("seeds: its hooks take the weights of one seed")
     assert reason("ppo_count") == "PPOCount does not learn by the steps that a batch of seeds shares"
     assert reason("ppo", amsgrad=True) == "Adam with these settings cannot be vectorised over seeds"
-    assert reason("lstm_ppo") is reason("ppo", "ewc") is None
+    assert reason("lstm_ppo") is reason("ppo", "ewc") is reason("ppo", "si") is None
 
 
 @pytest.mark.slow
