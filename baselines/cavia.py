@@ -60,7 +60,8 @@ class CAVIA(InnerLoop):
 
     def __init__(self, observation_spec: Composite, action_spec: TensorSpec, num_context: int, **settings: Any) -> None:
         require((is_int(num_context, 0), f"num_context must be an integer >= 0, got {num_context!r}"))
-        super().__init__(observation_spec, action_spec, num_context=num_context, **settings)
+        self.num_context = num_context
+        super().__init__(observation_spec, action_spec, **settings)
 
     def make_model(self, net: GatedNetwork, inner_rate: float) -> InnerModel:
         """See `InnerLoop`."""

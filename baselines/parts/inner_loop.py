@@ -283,13 +283,14 @@ class InnerLoop(Learner):
         num_epochs: steps of PPO on a batch.
         max_grad_norm: the gradients of PPO are scaled down to this norm.
         entropy_coeff: weight in PPO's loss of the entropy before the adaptation.
-        num_context: further inputs of the network.
     """
 
     memory = True
     needs_whole_trials = True
     output_keys = ("log_probs",)
     minibatch_size = 0  # batches differ in their number of trials
+    num_context = 0
+    """Inputs of the network beside observations."""
 
     policy: InnerPolicy
 
@@ -313,7 +314,6 @@ class InnerLoop(Learner):
         num_epochs: int,
         max_grad_norm: float,
         entropy_coeff: float,
-        num_context: int = 0,
     ) -> None:
         super().__init__(num_envs, num_steps, max_grad_norm)
         require(
@@ -334,18 +334,19 @@ class InnerLoop(Learner):
         require((num_steps >= 2 * adapt_episodes, f"{short}, got {num_steps}"))
         self.adapt_episodes = adapt_episodes
         self.trial_episodes = 2 * adapt_episodes
-        self.num_context = num_context
         self.entropy_coeff = entropy_coeff
         self.outer = outer
         self.max_kl = max_kl
         self.clip_epsilon = clip_epsilon
         self.num_epochs = num_epochs
         num_actions = num_actions_of(action_spec)
-        require_gated_weights(observation_spec, hidden_size, num_layers, num_context=num_context, gate_size=gate_size)
+        require_gated_weights(
+            observation_spec, hidden_size, num_layers, num_context=self.num_context, gate_size=gate_size
+        )
         self.specs = shown_specs(observation_spec)
         net = gated_network(
             self.specs,
-            num_context,
+            self.num_context,
             num_actions,
             hidden_size=hidden_size,
             num_layers=num_layers,

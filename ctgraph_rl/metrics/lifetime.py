@@ -194,19 +194,19 @@ def forward_transfer_ratio(regimes: Regimes) -> Tensor:
     return _transfer(regimes, _quotients, forward=True)
 
 
-@of_pairs("new2022/ft-contrast", "as ft-ratio, of (tp(e2) - tp(e1)) / (tp(e1) + tp(e2))", bounds=between(-1, 1))
+@of_pairs("new2022/ft-contrast", "as new2022/ft-ratio, of (tp(e2) - tp(e1)) / (tp(e1) + tp(e2))", bounds=between(-1, 1))
 def forward_transfer_contrast(regimes: Regimes) -> Tensor:
     """FT as a contrast: in [-1, 1], 0 is neutral; no value only where both are 0. Else as `forward_transfer_ratio`."""
     return _transfer(regimes, _contrasts, forward=True)
 
 
-@of_pairs("new2022/bt-ratio", "as ft-ratio, for trainings of a after b's first training", bounds=not_negative)
+@of_pairs("new2022/bt-ratio", "as new2022/ft-ratio, for trainings of a after b's first training", bounds=not_negative)
 def backward_transfer_ratio(regimes: Regimes) -> Tensor:
     """BT: what training a task a, after b's first training, does to b. Else as `forward_transfer_ratio`."""
     return _transfer(regimes, _quotients, forward=False)
 
 
-@of_pairs("new2022/bt-contrast", "as bt-ratio, of (tp(e2) - tp(e1)) / (tp(e1) + tp(e2))", bounds=between(-1, 1))
+@of_pairs("new2022/bt-contrast", "as new2022/bt-ratio, of (tp(e2) - tp(e1)) / (tp(e1) + tp(e2))", bounds=between(-1, 1))
 def backward_transfer_contrast(regimes: Regimes) -> Tensor:
     """BT as a contrast. Else as `backward_transfer_ratio`."""
     return _transfer(regimes, _contrasts, forward=False)
