@@ -103,7 +103,7 @@ class DQN(QLearner):
         after = {key: batch["next", key] for key in self.greedy.in_keys}
         predicted = self.values(batch).gather(-1, batch["action"].unsqueeze(-1)).squeeze(-1)
         with torch.no_grad():
-            later = self.with_others(others, DQN.values, after)
+            later = self.with_others(others, type(self).values, after)
             best = (self.values(after) if self.dqn.double_dqn else later).argmax(dim=-1, keepdim=True)
             gamma = later.new_tensor(self.gamma) ** batch["steps_to_next_obs"].view_as(batch["next", "reward"])
             running = (~batch["next", "terminated"]).int()

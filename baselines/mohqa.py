@@ -348,7 +348,7 @@ class MOHQA(QLearner):
         predicted = values.gather(-1, batch["action"].unsqueeze(-1))
         after = {key: batch["next", key] for key in (*self.policy.greedy.in_keys, "average")}
         with torch.no_grad():
-            best = self.with_others(others, MOHQA.values, after).amax(dim=-1, keepdim=True)
+            best = self.with_others(others, type(self).values, after).amax(dim=-1, keepdim=True)
             gamma = best.new_tensor(self.gamma) ** batch["steps_to_next_obs"].view_as(best)
             target = batch["next", "reward"] + gamma * ~batch["next", "terminated"] * best
         return {"loss_value": (predicted - target).square().mean()}

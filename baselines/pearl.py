@@ -287,7 +287,7 @@ class PEARL(Learner):
         after = tuple(batch["next", key] for key in self.specs)
         with torch.no_grad():
             later = self.policy.actor(*after, fixed).log_softmax(dim=-1)
-            soft = self.with_others(others, PEARL.smaller, after, fixed) - self.entropy_coeff * later
+            soft = self.with_others(others, type(self).smaller, after, fixed) - self.entropy_coeff * later
             value = (later.exp() * soft).sum(dim=-1, keepdim=True)
             reward = self.reward_scale * batch["next", "reward"]
             target = reward + self.gamma * ~batch["next", "terminated"] * value

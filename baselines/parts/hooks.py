@@ -18,7 +18,8 @@ class Hooks(nn.Module):
     """
 
     stackable: ClassVar[bool] = True
-    """Whether several seeds can share a gradient step, see `baselines.update.seeds`."""
+    """Whether several seeds can share a gradient step, see `baselines.update.seeds`; a class that has hooks of a method
+    in another form says it again."""
 
     of_one_seed: ClassVar[bool] = False
     """Whether `transform_gradients` and `after_step` take one seed's tensors, and are vectorised for several; else they
@@ -28,7 +29,7 @@ class Hooks(nn.Module):
     """Whether it draws or writes weights outside steps and boundaries, which seeds on a GPU cannot follow."""
 
     step_buffers: ClassVar[tuple[str, ...]] = ()
-    """Names of the buffers that the hooks of a step write."""
+    """Names of the buffers that the hooks of a step write, in place."""
 
     def network_weights(self, trained: list[nn.Parameter]) -> list[nn.Parameter]:
         """Return the parameters by which the agent's losses are differentiated, given what its optimiser trains."""

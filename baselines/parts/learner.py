@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from inspect import signature
 from typing import Any, ClassVar
 
 import torch
@@ -68,6 +69,7 @@ class Learner(TakesNumbers, nn.Module):
         require((not (compile and self.memory), "compile must be false for an agent with an LSTM, which gains nothing"))
         self.compiled_step: Update | None = compiled(update) if compile else None
         self._region: Region | None = None
+        self._takes_others = "others" in signature(self.loss).parameters
         self.method = Hooks()
         self.num_envs = num_envs
         self.num_steps = num_steps
@@ -166,9 +168,9 @@ class Learner(TakesNumbers, nn.Module):
         Args:
             batch: a minibatch.
             weights: by which the sum is differentiated; the networks have them.
-            others: as `other_weights` returns them, the second argument of ``loss`` where there are any.
+            others: as `other_weights` returns them, for a ``loss`` with an argument of this name.
         """
-        own = self.loss(batch, others) if others else self.loss(batch)  # type: ignore[call-arg]
+        own = self.loss(batch, others) if self._takes_others else self.loss(batch)  # type: ignore[call-arg]
         return {**own, **self.method.penalties(batch, weights)}
 
     def forward(self, function: Callable[..., Any], *given: Any) -> Any:

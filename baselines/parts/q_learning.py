@@ -110,7 +110,8 @@ class WithTarget(LossModule):
 class QLearner(Learner):
     """Learns action values from replayed experience; explores by random actions, less and less within a task.
 
-    A class that derives from it calls `set_networks`, and defines `experience` and the loss.
+    A class that derives from it calls `set_networks`, and defines `experience` and the loss. A loss that takes
+    ``others`` gets the target network's weights, for `with_others`; the network is then the attribute ``greedy``.
 
     Args:
         num_envs: environments that it learns from.

@@ -153,7 +153,7 @@ class RecurrentQ(QLearner):
         """
         online = self.quantiles(batch)
         with torch.no_grad():
-            later = self.with_others(others, RecurrentQ.quantiles, batch)
+            later = self.with_others(others, type(self).quantiles, batch)
         best = of_action(later, online.mean(dim=-1).argmax(dim=-1))
         steps = best.shape[1]
         positions = torch.arange(steps, device=best.device) + batch["steps_to_next_obs"]

@@ -238,6 +238,20 @@ def test_recurrent_targets_are_those_by_hand(small_agent, monkeypatch):
     assert loss == pytest.approx((1 + 1 + 1) / 3)
 
 
+@pytest.mark.parametrize("name", ["dqn", "drqn", "qrdqn_lstm", "mohqa", "pearl"])
+def test_targets_are_of_the_weights_that_a_loss_is_given(small_agent, name):
+    agent = small_agent(name, [ct_su_b1()])
+    [batch] = batches(agent, ct_su_b1(), 1)
+    minibatch = next(agent.minibatches(batch))
+    before = agent.loss(minibatch)["loss_value"]
+
+    given = agent.losses(minibatch, agent.weights, {key: 2 * value for key, value in agent.other_weights().items()})
+    for value in agent.other_weights().values():
+        value.data.mul_(2)
+
+    assert given["loss_value"] == agent.loss(minibatch)["loss_value"] != before
+
+
 def test_a_step_before_a_truncation_is_not_learned_from_and_one_before_a_terminal_state_is(small_agent):
     agent = small_agent("drqn", [ct_su_b1()], "agent.n_steps=2")
     batch = batches(agent, ct_su_b1(), 1)[0]

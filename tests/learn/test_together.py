@@ -16,6 +16,7 @@ from helpers.kill_runs import equal
 from helpers.scripted import ONE, THREE, TWO, ScriptedGroup, Told, decide, first_training, lines, of
 from helpers.small_agents import BATCHED, TINY, others_slow, saved_and_loaded
 
+from baselines.methods.l2 import L2
 from baselines.update import seeds as together
 from baselines.update.seeds import SeedGroup
 from baselines.update.stack import Stack
@@ -401,6 +402,17 @@ def test_a_group_of_which_every_seed_has_failed_stops(make, monkeypatch):
     assert all(lines(log)[-1]["frames"] < 80 for log in logs)
 
 
+class Doubled(L2):
+    """A method with a hook that its base does not know."""
+
+    def __init__(self) -> None:
+        super().__init__(coeff=1.0, heads="single")
+
+    def transform_gradients(self, gradients, weights):
+        """Gradients of one seed."""
+        return [2 * gradient for gradient in gradients]
+
+
 def test_what_cannot_be_one_batch_says_why(compose):
     def reason(agent: str, method: str = "finetune") -> str | None:
         cfg = compose(f"agent={agent}", f"method={method}", *TINY)
@@ -408,6 +420,11 @@ def test_what_cannot_be_one_batch_says_why(compose):
         return together.why_not_together(new_agent(CURRICULUM, make_agent, 0))
 
     assert reason("lstm_ppo", "finetune") == "LSTMPPO cannot be vectorised over seeds"
+    agent = new_agent(CURRICULUM, with_method(target(compose("agent=ppo", *TINY), "agent"), Doubled, CURRICULUM), 0)
+    assert (
+        together.why_not_together(agent)
+        == "Doubled cannot be vectorised over seeds: its hooks take the weights of one seed"
+    )
     assert str(reason("ppo", "mask_amsc")).startswith("MaskAMSC cannot be vectorised over seeds: ")
     assert reason("dqn") is reason("ppo", "mask_lc") is reason("ppo", "packnet") is None
     switching = of(Block((ONE, TWO), 96, ByEpisode(2, together=True)), boundaries="hidden")

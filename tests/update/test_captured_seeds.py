@@ -180,6 +180,7 @@ def test_eight_seeds_learn_from_what_each_would_alone_with_its_losses_and_gradie
     learn(group, EIGHT)
 
     assert all(method.samples.remaining == 0 for method in group.methods if hasattr(method, "samples"))
+    assert all((method.path != 0).any() for method in group.methods if hasattr(method, "path"))
     assert len(compared) == 4
     assert all(gradient.abs().max() > 0 for gradient in compared)
 
@@ -286,6 +287,7 @@ def test_what_cannot_be_captured_for_all_seeds_says_why(compose):
 
     assert reason("dqn") == "DQN cannot be vectorised over seeds on a GPU"
     assert reason("ppo", "packnet") == "PackNet cannot be vectorised over seeds on a GPU: it acts on batches"
+    assert str(reason("ppo", "clear")).endswith("on a GPU: it acts on batches")
     assert str(reason("ppo", "mask_sc")).endswith("seeds: its hooks take the weights of one seed")
     assert reason("ppo_count") == "PPOCount does not learn by the steps that a batch of seeds shares"
     assert reason("ppo", amsgrad=True) == "Adam with these settings cannot be vectorised over seeds"
