@@ -37,6 +37,7 @@ TABLES = {
     **dict.fromkeys(("rl2_search", "rewards_met"), "studies.baselines.runs"),
     **dict.fromkeys(OF_METHODS, "studies.lifelong.runs"),
     "memory_cells": "studies.memory.page",
+    "mohqa_published": "studies.memory.published",
     "collectives": "studies.collectives.runs",
     "no_labels": "studies.no_labels.runs",
     "rl2_swap": "studies.baselines.swap",

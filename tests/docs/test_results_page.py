@@ -92,8 +92,6 @@ def test_ewc_has_the_results_of_ppo_on_the_first_task_but_for_rounding(make, nam
     for seed in {seed for _, seed in first}:
         others = [a != b for a, b in zip(first["finetune", seed], first["ewc_published", seed], strict=True)]
         assert sum(others) == OF_OTHER_ROUNDING.get(name, {}).get(seed, 0)
-    said = "in four of ten seeds of CT8 one to three evaluations of the first task differ"
-    assert said in " ".join(LIFELONG.read_text(encoding="utf-8").split())
 
 
 @pytest.mark.parametrize("name", ["ct8_md", "ct8", "ct12", "fo_b1_4tasks", "fo_b1_4images", "fo_b1_depth2to5"])

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from string import Template
 
-from studies.memory import figures, graphs, ladder
+from studies.memory import figures, graphs, ladder, published
 from studies.memory.conditions import NAME, SHARED, TO_FIND, UNIQUE, Condition, finished
 from studies.memory.runs import AGENTS, SETTINGS, count, measured, ranking
 from studies.raw import HERE, TEMPLATES, Raw, grow, lost, machines, merged
@@ -72,7 +72,7 @@ def texts() -> dict[str, str]:
     found["lower"], found["alike"] = graphs.distinguishable()
     found |= {"lost": graphs.lost(), "with_noise": graphs.with_noise()}
     found |= {"solve_shared": graphs.better_than_poor(SHARED), "solve_unique": graphs.better_than_poor(UNIQUE)}
-    return found | ladder.texts() | {"intervals": graphs.intervals()}
+    return found | ladder.texts() | {"intervals": graphs.intervals(), "published": published.text()}
 
 
 def page() -> str:
