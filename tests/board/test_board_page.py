@@ -86,6 +86,15 @@ def test_what_the_page_says_of_single_lines_holds(made):
     assert "eight of ten seeds have the optimum with 30 steps, and the others 0.85 and 0.91" in page
     assert (returns[2:], [f"{value:.2f}" for value in returns[:2]]) == ([1.0] * 8, ["0.85", "0.91"])
 
+    adapted = [f"{score:.2f}" for score in sorted(alone["adaptation", "depth 2"].standings[0].entry.scores)]
+    assert "seven of ten seeds are at the best search, at 0.61 to 0.64, and three at 0.24 to 0.39" in page
+    assert (adapted[0], adapted[2], adapted[3], adapted[-1]) == ("0.24", "0.39", "0.61", "0.64")
+    assert f"{alone['adaptation', 'depth 2'].ceilings.search:.3f}" == "0.625"
+
+    shared = alone["sharing", ""].standings[0].entry.scores
+    assert "20 of 28 tasks in eight of ten seeds, 21 in two" in page
+    assert sorted(round(28 * score, 6) for score in shared) == [20] * 8 + [21] * 2
+
 
 def test_every_submission_is_verified_at_rerun_and_small(made):
     lines = [line for table in made for line in table.standings]
