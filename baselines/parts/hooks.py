@@ -18,15 +18,15 @@ class Hooks(nn.Module):
     """
 
     stackable: ClassVar[bool] = True
-    """Whether several seeds can share a gradient step, see `baselines.update.seeds`; a class that has hooks of a method
-    in another form says it again."""
+    """Whether several seeds can share a gradient step, see `baselines.update.seeds`. A subclass that overrides a
+    hook must set it again."""
 
     of_one_seed: ClassVar[bool] = False
     """Whether `transform_gradients` and `after_step` take one seed's tensors, and are vectorised for several; else they
     take those of several, too, with the seeds as a leading dimension."""
 
     acts_on_batches: ClassVar[bool] = False
-    """Whether it draws or writes weights outside steps and boundaries, which seeds on a GPU cannot follow."""
+    """Whether `on_batch` draws random numbers or changes weights, which seeds on a GPU cannot follow."""
 
     step_buffers: ClassVar[tuple[str, ...]] = ()
     """Names of the buffers that the hooks of a step write, in place."""

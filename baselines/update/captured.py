@@ -39,7 +39,8 @@ def why_not_captured(agent: Agent) -> str | None:
     if any(getattr(type(learner), own) is not getattr(PolicyGradient, own) for own in AS_EVER):
         return f"{name} does not learn by the steps that a batch of seeds shares"
     if learner.method.acts_on_batches:
-        return f"{type(learner.method).__name__} cannot be vectorised over seeds on a GPU: it acts on batches"
+        name = type(learner.method).__name__
+        return f"{name} cannot be vectorised over seeds on a GPU: it draws or changes weights before a batch"
     return why_not_step(learner)
 
 

@@ -28,6 +28,7 @@ from ctgraph_rl.agent import Agent
 from ctgraph_rl.learn.loop import Learnt
 
 HOOKS = ("on_batch", "transform_minibatch", "penalties", "transform_gradients", "after_step", "after_learning")
+"""The hooks of a method at a batch, for which the class that sets ``stackable`` vouches."""
 
 LARGEST_MINIBATCH = 512
 """Items of the largest minibatches that are stacked: with larger ones, products of one seed keep a core busy."""
@@ -49,7 +50,7 @@ def why_not_together(agent: Agent) -> str | None:
 def why_not_step(learner: Learner) -> str | None:
     """Return why the steps of a learner's method and optimiser cannot be those of several seeds; None if they can."""
     method = type(learner.method)
-    owner: Any = next(kind for kind in method.__mro__ if "stackable" in vars(kind))  # it knows its own hooks
+    owner: Any = next(kind for kind in method.__mro__ if "stackable" in vars(kind))
     if not owner.stackable or any(getattr(method, hook, None) is not getattr(owner, hook, None) for hook in HOOKS):
         name = method.__name__
         return f"{name} cannot be vectorised over seeds: its hooks take the weights of one seed"

@@ -135,7 +135,7 @@ def _descend(learner: Learner, weights: Sequence[Tensor], state: UpdateState, gr
     is_stacked = state.tensors is not None
     if is_stacked:
         gradients = [unstacked(gradient) for gradient in gradients]
-    gradients = transformed(learner, weights, state, gradients)
+    gradients = transform_gradients(learner, weights, state, gradients)
     if is_stacked:
         gradients = [unstacked(gradient).contiguous() for gradient in gradients]
     norm = norm_of(gradients, num_leading=int(is_stacked))
@@ -149,16 +149,16 @@ def _descend(learner: Learner, weights: Sequence[Tensor], state: UpdateState, gr
     return norm
 
 
-def transformed(
+def transform_gradients(
     learner: Learner, weights: Sequence[Tensor], state: UpdateState, gradients: Sequence[Tensor]
 ) -> Sequence[Tensor]:
     """Return the gradients of what is trained, given those of the weights."""
     if state.tensors is not None and learner.method.of_one_seed:
-        return over_seeds(learner, _transformed, state, gradients)
-    return _transformed(learner, weights, gradients)
+        return over_seeds(learner, _transform_gradients, state, gradients)
+    return _transform_gradients(learner, weights, gradients)
 
 
-def _transformed(learner: Learner, weights: Sequence[Tensor], gradients: Sequence[Tensor]) -> Sequence[Tensor]:
+def _transform_gradients(learner: Learner, weights: Sequence[Tensor], gradients: Sequence[Tensor]) -> Sequence[Tensor]:
     return learner.method.transform_gradients(gradients, weights)
 
 

@@ -363,6 +363,19 @@ def test_each_memory_has_the_setting_of_the_ladder_that_did_best_in_a_search_ove
     )
 
 
+def test_what_the_page_says_of_mohqa_with_its_published_settings_holds():
+    with open(FOLDER / "mohqa_published.csv", newline="", encoding="utf-8") as file:
+        lines = list(csv.DictReader(file))
+
+    assert [(line["agent"], line["frames"], line["unique_decisions"]) for line in lines] == [
+        ("mohqa", "1000000", "True")
+    ] * 2
+    assert [float(line["greedy_return"]) for line in lines] == [0.28, 0.31]
+    assert "two seeds end at 0.28 and 0.31 (0 of 2 seeds solve it, 1 at any evaluation)" in PAGE
+    assert [line["frames_to_90"] for line in lines] == ["", "600000"]
+    assert "one of two seeds with its published settings solves the graph with unique decisions for a time" in PAGE
+
+
 def test_what_the_page_says_in_words_of_the_ladder_holds(names):
     search, ladder = ladder_lines()
     of = defaultdict(dict)

@@ -20,7 +20,7 @@ from baselines.methods.l2 import L2
 from baselines.update import seeds as together
 from baselines.update.seeds import SeedGroup
 from baselines.update.stack import Stack
-from baselines.update.update import losses_of, total_loss, transformed, unstacked, update, with_tensors
+from baselines.update.update import losses_of, total_loss, transform_gradients, unstacked, update, with_tensors
 from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, learn_curriculum
 from ctgraph_rl.learn.stacked import learn_together, why_not_together
 from ctgraph_rl.runs.config import target
@@ -167,7 +167,7 @@ def of_all(group: SeedGroup, minibatches) -> tuple[dict[str, torch.Tensor], list
     batch = {key: torch.stack([wide(each[key]) for each in minibatches]) for key in minibatches[0]}
     losses = losses_of(first, state, batch)
     gradients = list(map(unstacked, torch.autograd.grad(total_loss(losses).sum(), state.weights)))
-    return losses, list(with_tensors(first, state, transformed, state, gradients))
+    return losses, list(with_tensors(first, state, transform_gradients, state, gradients))
 
 
 def of_one(learner, minibatch) -> tuple[dict[str, torch.Tensor], list[torch.Tensor]]:
