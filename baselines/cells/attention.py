@@ -1,10 +1,11 @@
 """Attention: a block of a causal transformer over the last steps of an episode.
 
-Vaswani et al. 2017 (arXiv 1706.03762), with normalised inputs of each part (Xiong et al. 2020, arXiv 2002.04745) and a
-learned bias for each head and distance in place of positions (Raffel et al. 2020, arXiv 1910.10683):
+Vaswani et al. 2017 (arXiv 1706.03762), with normalised inputs of each part and a normalised output (Xiong et al. 2020,
+arXiv 2002.04745), and a learned bias for each head and distance in place of positions (Raffel et al. 2020, arXiv
+1910.10683):
 
     x_t = W x'_t,  n_t = norm(x_t),  a_t = sum_s softmax_s(q(n_t) . k(n_s) / sqrt(n) + bias_{t-s}) v(n_s),
-    y_t = x_t + W_o a_t,  output_t = y_t + W_2 relu(W_1 norm(y_t)),
+    y_t = x_t + W_o a_t,  output_t = norm(y_t + W_2 relu(W_1 norm(y_t))),
 
 where s are the steps of the episode among the last ``num_frames``, and x' are the inputs.
 """
@@ -65,6 +66,7 @@ class Attention(Cell):
         self.narrower = linear_layer(2 * num_outputs, num_outputs)
         self.first_norm = nn.LayerNorm(num_outputs, dtype=torch.float32, device="cpu")
         self.second_norm = nn.LayerNorm(num_outputs, dtype=torch.float32, device="cpu")
+        self.last_norm = nn.LayerNorm(num_outputs, dtype=torch.float32, device="cpu")
         self.bias = nn.Parameter(torch.empty(num_heads, num_frames, dtype=torch.float32, device="cpu"))
         self.reset_parameters()
 
@@ -117,7 +119,7 @@ class Attention(Cell):
         a = (shares @ v).transpose(1, 2).flatten(2)
         y = x[:, -num_steps:] + self.leave(a)
         wide = self.wider(self.second_norm(y)).relu()
-        return y + self.narrower(wide)
+        return self.last_norm(y + self.narrower(wide))
 
     def _by_head(self, values: Tensor) -> Tensor:
         """Return values as [rows, num_heads, steps, width]."""
