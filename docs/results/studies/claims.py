@@ -25,6 +25,9 @@ RECURRENT = [
     "lstm_ppo-backpropamine",
 ]
 BASE = "lstm_ppo"
+RIVALS = {"attention": "lstm_ppo-attention", "mohqa": "mohqa", "backpropamine": "lstm_ppo-backpropamine"}
+"""Agents with attention, associative learning and neuromodulation."""
+
 SHARED = [condition for condition in GIVEN if condition.unique_decisions == "False"]
 """Confounding graphs of the paper: all decision states show one image."""
 
@@ -80,11 +83,11 @@ def of_rival(name: str) -> tuple[Raw, Comparison]:
 
 
 def advantages() -> dict[str, str]:
-    """What the page says of associative learning and neuromodulation on confounding graphs."""
+    """What the page says of attention, associative learning and neuromodulation on confounding graphs."""
     base, _ = of_rival(BASE)
     said = {"lstm": f"{sum(solved(base))} of {len(base)}"}
     better = []
-    for key, name in (("mohqa", "mohqa"), ("backpropamine", "lstm_ppo-backpropamine")):
+    for key, name in RIVALS.items():
         lines, found = of_rival(name)
         better.append(above(found.difference))
         said |= {key: f"{sum(solved(lines))} of {len(lines)}", f"{key}_difference": shown(found.difference)}

@@ -73,12 +73,13 @@ def test_the_sentence_on_large_sets_has_the_differences_of_the_raw_results():
     assert f"No agent loses more than {-min(changes.values())} of five seeds on a graph." in TEXT
 
 
-def test_the_sentence_on_associative_learning_has_the_returns_of_the_raw_results():
+def test_the_sentence_on_attention_and_associative_learning_has_the_returns_of_the_raw_results():
     shared = {key: value for key, value in returns().items() if key[2] == "False"}
     of = {name: [value for key, value in shared.items() if key[0] == name] for name in {key[0] for key in shared}}
     number, verdict = rows()[4][3:]
 
-    for name, agent in (("MOHQA", "mohqa"), ("Backpropamine", "lstm_ppo-backpropamine")):
+    rivals = {"attention": "lstm_ppo-attention", "MOHQA": "mohqa", "Backpropamine": "lstm_ppo-backpropamine"}
+    for name, agent in rivals.items():
         shown, low = re.search(rf"{name} (\S+) \[(\S+), ", number).groups()
         assert float(shown) == pytest.approx(np.mean(of[agent]) - np.mean(of["lstm_ppo"]), abs=0.0051)
         assert float(low) < 0 and verdict == "**not found**"

@@ -9,7 +9,7 @@ from typing import Any
 from studies.memory import ladder
 from studies.memory.conditions import GIVEN, columns
 from studies.memory.graphs import ceiling
-from studies.memory.runs import AGENTS, CELLS, SEEDS, returns, solved
+from studies.memory.runs import AGENTS, LADDER_CELLS, SEEDS, returns, solved
 from studies.raw import Raw
 
 DPI = 220
@@ -72,19 +72,19 @@ def draw_ladder(path: Path) -> None:
     from ctgraph_rl.visualize.style import new_figure, save_figure
 
     of = ladder.finished()
-    figure = new_figure(7.2, 0.9 + 0.24 * len(CELLS))
+    figure = new_figure(7.2, 0.9 + 0.24 * len(LADDER_CELLS))
     panels = figure.subplots(1, 3, sharey=True)
     for axes, depth in zip(panels, "234", strict=True):
         lengths = [length for each, length in ladder.RUNGS if each == depth]
-        for row, name in enumerate(CELLS):
+        for row, name in enumerate(LADDER_CELLS):
             for column, length in enumerate(lengths):
                 _square(axes, (column, row), of.get((depth, length), {}).get(name))
-        axes.set(xlim=(-0.5, len(lengths) - 0.5), ylim=(len(CELLS) - 0.5, -0.5))
+        axes.set(xlim=(-0.5, len(lengths) - 0.5), ylim=(len(LADDER_CELLS) - 0.5, -0.5))
         axes.set_title(f"depth {depth}", fontsize=8)
         axes.set_xticks(range(len(lengths)), lengths, fontsize=7)
         axes.set_xlabel("expected episode length (steps)", fontsize=7)
         axes.tick_params(length=0)
-    panels[0].set_yticks(range(len(CELLS)), [AGENTS[name] for name in CELLS], fontsize=7)
+    panels[0].set_yticks(range(len(LADDER_CELLS)), [AGENTS[name] for name in LADDER_CELLS], fontsize=7)
     save_figure(figure, path, DPI)
 
 

@@ -6,7 +6,7 @@ one graph with the seeds of `SEARCHED`; ``memory_ladder`` gives each cell the se
 
 from __future__ import annotations
 
-from studies.memory.runs import CELLS, SEEDS, SETTINGS, count, mean, ranking
+from studies.memory.runs import LADDER_CELLS, SEEDS, SETTINGS, count, mean, ranking
 from studies.raw import Raw, groups, read
 
 NAME = "memory_ladder"
@@ -49,7 +49,7 @@ def finished() -> dict[tuple[str, str], dict[str, Raw]]:
     for (depth, length, agent, *_), own in groups(lines, "depth", "expected_length", "agent", *SETTINGS).items():
         if len(own) == SEEDS:
             found.setdefault((depth, length), {})[agent] = own
-    return {rung: {agent: of[agent] for agent in CELLS if agent in of} for rung, of in found.items()}
+    return {rung: {agent: of[agent] for agent in LADDER_CELLS if agent in of} for rung, of in found.items()}
 
 
 def texts() -> dict[str, str]:

@@ -24,6 +24,7 @@ AGENTS = {
     "lstm_ppo-amrl_max": "AMRL-Max",
     "lstm_ppo-amrl_avg": "AMRL-Avg",
     "lstm_ppo-backpropamine": "Backpropamine",
+    "lstm_ppo-attention": "attention",
     "lstm_ppo-frames": "frame stacking",
     "lstm_ppo-none": "PPO (no memory)",
     "a2c, 8 steps": "A2C (8 steps)",
@@ -37,7 +38,8 @@ AGENTS = {
 }
 """Names of agents with their cells, in the order of the page; PPO where no other algorithm is named."""
 
-CELLS = [name for name in AGENTS if name.startswith("lstm_ppo")]
+LADDER_CELLS = [name for name in AGENTS if name.startswith("lstm_ppo") and name != "lstm_ppo-attention"]
+"""Agents on the ladder."""
 
 STEPS = {"dqn": "n_steps", "a2c": "num_steps", "reinforce": "num_steps"}
 """The setting that tells the runs of an agent apart: the steps of its targets, or of its batches."""
