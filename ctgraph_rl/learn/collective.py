@@ -303,6 +303,8 @@ class _Collective:
                     self._post(message)
             received = {number: self._take(number, kind) for number in received}
         for number, messages in received.items():
+            if self.learners[number].is_done:
+                continue
             for given in self.exchange.receive(number, messages):
                 self._log_help(given)
         for kind in sorted({of for of, _ in self.mail.counts}):
