@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import sys
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
+from omegaconf import OmegaConf
+
 from ctgraph_rl import parsers, run
+from ctgraph_rl.checks import require
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
 from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.profile.profile_page import text_table, write_profile
 from ctgraph_rl.report.style import require_packages
+from ctgraph_rl.report.terminal import print_problems
+from ctgraph_rl.runs.read import find_runs
 
 FOLDER = "hydra.sweep.dir"
 
 
 def main() -> None:
-    """Train where there are settings, then write and print the profile; the exit code is 1 where cells are not done."""
+    """Train where there are settings, then write and print the profile; the exit code is 1 where runs are missing."""
     parser = parsers.profile()
     arguments = parser.parse_args()
     settings = [word for word in arguments.words if "=" in word]
@@ -30,10 +36,17 @@ def main() -> None:
             given["hydra/launcher"] = "joblib"
         given.update(word.split("=", 1) for word in settings)
         folders.append(given[FOLDER])
+        learned = given["curriculum"]
+        with refused_by(parser):
+            require(("profile_" in learned, f"a profile learns curricula profile_*, got curriculum={learned}"))
         complete = _train(given, arguments.config_dir)
     out = arguments.out or Path(folders[0], "profile")
     with refused_by(parser):
+        if arguments.config_dir is not None:
+            _import_agents(arguments.config_dir)
         scores = write_profile(folders, out, arguments.agent)
+    runs, problems = find_runs(folders)
+    complete = not print_problems(problems, runs) and complete
     print(terminal_lines(text_table(scores)))
     print(f"profile: {terminal_text(out / 'profile.md')}")
     sys.exit(0 if complete else 1)
@@ -51,6 +64,14 @@ def _train(settings: dict[str, str], config_dir: Path | None) -> bool:
             raise
         return False
     return True
+
+
+def _import_agents(config_dir: Path) -> None:
+    """Import the modules of the user's agents, so that their runs can be loaded."""
+    for path in config_dir.glob("agent/*.yaml"):
+        target = OmegaConf.load(path).get("_target_")
+        if target is not None:
+            import_module(target.rpartition(".")[0])
 
 
 if __name__ == "__main__":

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
-from torch import Tensor
+from torch import Tensor, nn
 
 from ctgraph_rl.checks import by_name
 from ctgraph_rl.log.run_log import RunLog
@@ -129,7 +130,10 @@ def teaches(run: Evidence) -> Measured:
 
     0 is a table of frequencies, 1 the exact model; see `baselines.models.model.learned_share`.
     """
-    trained = load(run.folder)
+    config = run.log.of_kind("run")[0].get("config") or {}
+    module, _, name = str(config.get("agent", {}).get("_target_")).rpartition(".")
+    kind = getattr(sys.modules.get(module), name, None)
+    trained = load(run.folder, kind if isinstance(kind, type) and issubclass(kind, nn.Module) else None)
     [task] = run.tasks
     share = taught_share(trained.policy_for(task), task, trained.agent.initial_state)
     return Measured(max(0.0, share), 0.0, 1.0)

@@ -16,7 +16,7 @@ from ctgraph_rl.profile.properties import Evidence, Measured, measure
 from ctgraph_rl.report.intervals import UNBOUNDED, Bounds
 from ctgraph_rl.report.names import displayed
 from ctgraph_rl.report.statistics import mean
-from ctgraph_rl.runs.read import BySeed, Run, find_runs, grouped
+from ctgraph_rl.runs.read import MODIFIED, BySeed, Run, find_runs, grouped
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 
@@ -68,7 +68,8 @@ def profile_scores(paths: Sequence[Path | str], agents: Sequence[str] = ()) -> d
         agents: names and order of agents, see `ctgraph_rl.report.names.displayed`.
 
     Returns:
-        For each agent its score by the title of each property; one without a run or a value says why.
+        For each agent its score by the title of each property; one without a run or a value says why. A modified
+        curriculum counts where there is no run of the published one, and the reason names it.
 
     Raises:
         ValueError: if there is no run of a profile curriculum.
@@ -83,7 +84,12 @@ def profile_scores(paths: Sequence[Path | str], agents: Sequence[str] = ()) -> d
     for (curriculum, agent), by_seed in grouped(displayed(runs, agents)).items():
         prop = properties[curriculum.partition(" ")[0]]
         missing = {each.title: Score(None, reason="there is no run") for each in properties.values()}
-        found.setdefault(agent, missing)[prop.title] = _over_seeds(by_seed, prop)
+        scores = found.setdefault(agent, missing)
+        score = _over_seeds(by_seed, prop)
+        if MODIFIED not in curriculum:
+            scores[prop.title] = score
+        elif not scores[prop.title].n:
+            scores[prop.title] = score._replace(reason=f"of {curriculum}{score.reason and ': '}{score.reason}")
     return found
 
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-import shutil
+import re
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -207,7 +208,7 @@ def test_a_recorded_run_is_scored_and_what_was_not_run_is_a_gap(tmp_path):
 
     scores = profile_scores([tmp_path])["Mine"]
 
-    assert scores["attention"].value == 0
+    assert (scores["attention"].value, scores["attention"].reason) == (0, "of profile_attention (modified)")
     assert (scores["memory"].value, scores["memory"].reason) == (None, "there is no run")
 
 
@@ -215,11 +216,15 @@ def test_a_recorded_run_is_scored_and_what_was_not_run_is_a_gap(tmp_path):
 def test_the_command_trains_an_agent_of_the_user_scores_and_draws(tmp_path):
     own = tmp_path / "conf" / "agent" / "mine.yaml"
     own.parent.mkdir(parents=True)
-    shutil.copy(Path(conf_dir(), "agent", "ppo.yaml"), own)
+    (tmp_path / "mine.py").write_text("from baselines.ppo import PPO\nclass Mine(PPO):\n    pass\n")
+    ours = Path(conf_dir(), "agent", "ppo.yaml").read_text(encoding="utf-8")
+    own.write_text(ours.replace("baselines.ppo.PPO", "mine.Mine"), encoding="utf-8")
     words = ["profile", "--config-dir", "conf", "agent=mine", "seed=0", "curriculum.num_frames=2048"]
     start = "from ctgraph_rl.cli import main; main()"
 
-    done = subprocess.run([sys.executable, "-c", start, *words], cwd=tmp_path, capture_output=True, text=True)
+    run = partial(subprocess.run, cwd=tmp_path, capture_output=True, text=True)  # where ``mine`` is found
+    done = run([sys.executable, "-c", start, *words])
 
     assert done.returncode == 0, done.stderr
+    assert re.search(r"model +0\.\d\d  \(of profile_model \(modified\)\)", done.stdout)
     assert (tmp_path / "runs" / "profile" / "profile" / "figures" / "profile.png").is_file()
