@@ -15,6 +15,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from baselines.cells.cell import PREVIOUS_ACTION
+from baselines.methods.method import Method
 from baselines.parts.learner import finite_means, table_of
 from baselines.parts.networks import Data, Items, TensorsByName, sequences_of
 from baselines.parts.policy_gradient import PolicyGradient
@@ -38,9 +39,9 @@ def why_not_captured(agent: Agent) -> str | None:
         return f"{name} cannot be vectorised over seeds on a GPU"
     if any(getattr(type(learner), own) is not getattr(PolicyGradient, own) for own in AS_EVER):
         return f"{name} does not learn by the steps that a batch of seeds shares"
-    if learner.method.acts_on_batches:
-        name = type(learner.method).__name__
-        return f"{name} cannot be vectorised over seeds on a GPU: it draws or changes weights before a batch"
+    method = type(learner.method)
+    if method.acts_on_batches or getattr(method, "after_learning", None) not in (None, Method.after_learning):
+        return f"{method.__name__} cannot be vectorised over seeds on a GPU: it acts before or after a batch"
     return why_not_step(learner)
 
 
@@ -182,8 +183,6 @@ class CapturedGroup(SeedGroup):
             for minibatch in self._minibatches(items):
                 steps.append(self.gradient_step(self._transformed(minibatch)))
         self.stack.write()
-        for method in self.methods:
-            method.after_learning()
         columns = table_of(steps).cpu().unbind(2)
         weights = [self.stack.kept[name].detach().flatten(1) for name in self.stack.learned]
         largest = torch.stack([each.abs().amax(dim=1) for each in weights]).amax(dim=0).cpu()

@@ -202,6 +202,9 @@ class SeedGroup:
         for stack in self.stacks:
             numbers = range(len(measured), len(measured) + len(stack.learners))
             measured += self._learn_at_once(stack, numbers, parts)
+        for number, method in enumerate(self.methods):
+            with self.random(number):
+                method.after_learning()
         return measured
 
     def _learn_at_once(self, stack: Stack, numbers: Sequence[int], parts: Sequence[TensorDictBase]) -> list[Learnt]:
@@ -213,8 +216,6 @@ class SeedGroup:
         while given := self._next(minibatches):
             steps.append(self._update(stack, given, errors))
         stack.write()
-        for method in self.methods:
-            method.after_learning()
         names = list(steps[0])
         table = table_of(steps).unbind(-1)
 

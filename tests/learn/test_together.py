@@ -17,6 +17,7 @@ from helpers.scripted import ONE, THREE, TWO, ScriptedGroup, Told, decide, first
 from helpers.small_agents import BATCHED, TINY, others_slow, saved_and_loaded
 
 from baselines.methods.l2 import L2
+from baselines.methods.method import Method
 from baselines.update import seeds as together
 from baselines.update.seeds import SeedGroup
 from baselines.update.stack import Stack
@@ -270,9 +271,13 @@ def test_a_compiled_step_is_the_same_step_of_fewer_seeds_at_a_time(make, monkeyp
 
     monkeypatch.setattr(SeedGroup, "_step", compared)
     monkeypatch.setattr(together, "_most_at_once", lambda learner: 2)
+    ended = []
+    monkeypatch.setattr(Method, "after_learning", lambda method: ended.append((len(sizes), id(method))))
     its.learn()
 
     assert set(sizes) == {2, 1}, "of two seeds, and of the third"
+    assert len(set(ended)) == len(ended), "each method once a batch"
+    assert len({after for after, _ in ended}) == len(ended) / 3, "after the steps of all seeds"
 
 
 def state_in_double(state):
