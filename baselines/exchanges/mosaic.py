@@ -139,7 +139,11 @@ class Mosaic(MaskExchange):
         points = sampled_points(known.recent, self.num_samples, self.num_actions, self.generator)
         new = linear_wasserstein(points, reference_points(self.num_references, points.shape[1]))
         known.embedding = (new if known.embedding is None else known.embedding + new) / 2
-        query = {**self.kinds["query"], "embedding": Array(tuple(new.shape))}
+        self._expect(tuple(new.shape))
+
+    def _expect(self, shape: tuple[int, ...]) -> None:
+        """Refuse queries whose embedding has another shape."""
+        query = {**self.kinds["query"], "embedding": Array(shape)}
         self.kinds = {**self.kinds, "query": query}
 
     def send(self, kind: str, member: int, received: Sequence[Message]) -> Sequence[Message]:
@@ -210,12 +214,14 @@ class Mosaic(MaskExchange):
     def state_dict(self) -> NamedValues:
         """Return returns, embeddings, transitions and the random stream."""
         known = [dict(vars(each)) for each in self.known]
-        return {**super().state_dict(), "known": known, "random": self.generator.get_state()}
+        shape = self.kinds["query"]["embedding"].shape
+        return {**super().state_dict(), "known": known, "shape": shape, "random": self.generator.get_state()}
 
     def load_state_dict(self, state: ReadOnlyValues) -> None:
         """Restore what `state_dict` returned."""
         super().load_state_dict(state)
         self.known = [KnownMask(**each) for each in state["known"]]
+        self._expect(tuple(state["shape"]))
         self.generator.set_state(state["random"])
 
 

@@ -330,6 +330,8 @@ class InnerLoop(Learner):
             *one_of(GATES, gate=gate),
             *one_of(OUTER, outer=outer),
         )
+        ignored = f"entropy_coeff is of outer=ppo: set it to 0, got {entropy_coeff!r} with outer={outer!r}"
+        require((outer == "ppo" or entropy_coeff == 0, ignored))
         short = f"num_steps must be at least the 2 * adapt_episodes={2 * adapt_episodes} episodes of a trial"
         require((num_steps >= 2 * adapt_episodes, f"{short}, got {num_steps}"))
         self.adapt_episodes = adapt_episodes

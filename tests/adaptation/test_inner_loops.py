@@ -435,6 +435,7 @@ def test_a_run_resumes_as_if_it_had_not_stopped(name, outer, tmp_path):
     [
         ({"gate": "hrad"}, "gate must be one of none, soft, hard, hard_straight_through, got 'hrad'"),
         ({"outer": "sgd"}, "outer must be one of trpo, ppo, got 'sgd'"),
+        ({"entropy_coeff": 0.1}, "entropy_coeff is of outer=ppo: set it to 0, got 0.1 with outer='trpo'"),
         ({"num_steps": 3}, "num_steps must be at least the 2 .* adapt_episodes=4 episodes of a trial, got 3"),
         ({"inner_rate": 0}, "inner_rate must be"),
     ],

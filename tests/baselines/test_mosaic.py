@@ -190,6 +190,7 @@ def test_the_most_similar_are_taken_and_a_restored_exchange_does_the_same(make):
         exchange.observe(number, batch(0.0, seed), 0.2 * number)
     other, _ = connected(members, top_n=1, seed=8)
     other.load_state_dict(saved_and_loaded(exchange.state_dict()))
+    assert other.kinds == exchange.kinds
     for each in (exchange, other):
         for number in range(3):
             each.observe(number, batch(0.0, number), 0.2 * number)

@@ -37,7 +37,7 @@ def names_in(cell: str) -> list[str]:
 
 def curricula_with_a_study() -> set[str]:
     """The named curricula that raw results of a study are of."""
-    found = {"su_b1_4tasks", "co_hard", "nm_uniform_goals"}  # files of one curriculum do not name it
+    found = {"su_b1_4tasks", "co_hard", "nm_uniform_goals", "su_b1_changing_goals"}  # their files do not name them
     for path in RESULTS.glob("*.csv"):
         if path.stem == "every_curriculum":
             continue  # the short runs, which cards show

@@ -70,6 +70,8 @@ def test_the_end_may_be_the_mean_of_the_last_evaluations():
 
     assert found[0].value == (0.25 + 0.625 + 0.625) / 3
     assert found[1].terms == (0.75 - 0.25, 0.75 - 0.625, 0.0)
+    with pytest.raises(ValueError, match="last must be an integer >= 1, got 0"):
+        metrics.continual_world_performance(CURVES, 0)
 
 
 def test_more_last_evaluations_than_a_block_has_are_undefined():

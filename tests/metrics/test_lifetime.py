@@ -95,6 +95,8 @@ def test_preparing_scales_each_task_to_its_own_range_and_a_constant_one_to_one()
     assert [each.values.tolist() for each in scaled] == [[1.0, 26.0], [101.0], [1.0, 1.0]]
     assert [each.values.tolist() for each in given] == [[1.0, 13.5], [51.0], [51.0, 51.0]]
     assert experts["a"][0].tolist() == [101.0]
+    with pytest.raises(ValueError, match=r"ranges must have each task, there is none of \['b'\]"):
+        metrics.prepare(regimes, ranges={"a": (0.0, 4.0)})
 
 
 def test_mean_performance_is_of_each_tasks_own_regimes_first():
