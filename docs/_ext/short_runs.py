@@ -21,7 +21,7 @@ METHODS = {"finetune": "fine-tuning", "mask_ri": "Mask RI", "ewc": "EWC", "multi
 STYLES = dict(zip(METHODS, ("-", "--", ":", "-."), strict=True))
 
 STUDIES = {
-    "baselines": ("penn_a_swap", "single_task", "su_b1_4tasks"),
+    "baselines": ("penn_a_swap", "single_task", "su_b1_4tasks", "su_b1_changing_goals"),
     "lifelong": ("ct8", "ct8_md", "ct12", "fo_b1_4images", "fo_b1_4tasks", "fo_b1_depth2to5"),
     "no_labels": (
         *("su_b1_4images", "co_b1_4images", "posr_b1_4images", "dick2020_pair", "swoks_2x4"),
