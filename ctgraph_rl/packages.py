@@ -106,6 +106,16 @@ def speed_suite(name: str) -> ModuleType:
         return import_module(f"benchmarks.{name}")
 
 
+def import_agents(config_dir: Path) -> None:
+    """Import the modules of a user's agents, so that their runs can be loaded."""
+    import yaml
+
+    for path in config_dir.glob("agent/*.yaml"):
+        target = (yaml.safe_load(path.read_text(encoding="utf-8")) or {}).get("_target_")
+        if target is not None:
+            import_module(target.rpartition(".")[0])
+
+
 def command(module: str) -> Callable[[], None]:
     """Return the ``main`` of a module of this package, of `curricula` or of `baselines`.
 

@@ -118,6 +118,7 @@ class Mosaic(MaskExchange):
         require((self.top_n <= room, f"top_n must be at most method.max_received={room}, got {self.top_n}"))
         self.num_actions = max(method.num_actions for method in self.methods)
         self.known: list[KnownMask] = [KnownMask() for _ in agents]
+        self.shape: tuple[int, ...] = ()
         scores = Array((len(self.methods[0].weights),))
         self.kinds = {
             "query": {**ABOUT, "embedding": Array(())},  # its length is that of the first one that is made
@@ -143,6 +144,7 @@ class Mosaic(MaskExchange):
 
     def _expect(self, shape: tuple[int, ...]) -> None:
         """Refuse queries whose embedding has another shape."""
+        self.shape = shape
         query = {**self.kinds["query"], "embedding": Array(shape)}
         self.kinds = {**self.kinds, "query": query}
 
@@ -214,8 +216,8 @@ class Mosaic(MaskExchange):
     def state_dict(self) -> NamedValues:
         """Return returns, embeddings, transitions and the random stream."""
         known = [dict(vars(each)) for each in self.known]
-        shape = self.kinds["query"]["embedding"].shape
-        return {**super().state_dict(), "known": known, "shape": shape, "random": self.generator.get_state()}
+        values = {"known": known, "shape": self.shape, "random": self.generator.get_state()}
+        return {**super().state_dict(), **values}
 
     def load_state_dict(self, state: ReadOnlyValues) -> None:
         """Restore what `state_dict` returned."""

@@ -11,7 +11,6 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import at_least_one, require
 from ctgraph_rl.metrics.bounds import (
     not_negative,
     of_changes_but_one,
@@ -101,7 +100,8 @@ class Curves:
 
     def at_end_of(self, block: int, task: int, last: int) -> Tensor:
         """Mean of a task's last evaluations in a block."""
-        require(*at_least_one(last=last))
+        if last < 1:
+            raise ValueError(f"last must be an integer >= 1, got {last!r}")
         rows = self.of_block(block)
         if len(rows) < last:
             raise Undefined(f"the definition needs {last} evaluations in block {block}, it has {len(rows)}")

@@ -28,7 +28,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import require
 from ctgraph_rl.metrics.bounds import between, from_failure_to_best, not_negative
 from ctgraph_rl.metrics.record import defined, float64
 from ctgraph_rl.metrics.regimes import Regime, RegimeTable
@@ -80,7 +79,8 @@ def prepare(regimes: Regimes, experts: Experts | None = None, ranges: Ranges | N
     expert_curves = {task: [smooth(curve) for curve in curves] for task, curves in (experts or {}).items()}
     scales = _ranges(smoothed, expert_curves) if ranges is None else ranges
     missing = sorted(set(table.names) - set(scales))
-    require((not missing, f"ranges must have each task, there is none of {missing}"))
+    if missing:
+        raise ValueError(f"ranges must have each task, there is none of {missing}")
     limits = float64([scales[task] for task in table.names]).view(-1, 2)
     low, high = limits.unbind(1)
     of_task = torch.from_numpy(table.task.repeat(table.length))

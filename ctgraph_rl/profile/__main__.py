@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import sys
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-
-from omegaconf import OmegaConf
 
 from ctgraph_rl import parsers, run
 from ctgraph_rl.checks import require
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
 from ctgraph_rl.log.refuse import refused_by
+from ctgraph_rl.packages import import_agents
 from ctgraph_rl.profile.profile_page import text_table, write_profile
 from ctgraph_rl.report.style import require_packages
 from ctgraph_rl.report.terminal import print_problems
@@ -43,7 +41,7 @@ def main() -> None:
     out = arguments.out or Path(folders[0], "profile")
     with refused_by(parser):
         if arguments.config_dir is not None:
-            _import_agents(arguments.config_dir)
+            import_agents(arguments.config_dir)
         scores = write_profile(folders, out, arguments.agent)
     runs, problems = find_runs(folders)
     complete = not print_problems(problems, runs) and complete
@@ -64,14 +62,6 @@ def _train(settings: dict[str, str], config_dir: Path | None) -> bool:
             raise
         return False
     return True
-
-
-def _import_agents(config_dir: Path) -> None:
-    """Import the modules of the user's agents, so that their runs can be loaded."""
-    for path in config_dir.glob("agent/*.yaml"):
-        target = OmegaConf.load(path).get("_target_")
-        if target is not None:
-            import_module(target.rpartition(".")[0])
 
 
 if __name__ == "__main__":

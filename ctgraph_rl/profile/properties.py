@@ -133,7 +133,8 @@ def teaches(run: Evidence) -> Measured:
     config = run.log.of_kind("run")[0].get("config") or {}
     module, _, name = str(config.get("agent", {}).get("_target_")).rpartition(".")
     kind = getattr(sys.modules.get(module), name, None)
-    trained = load(run.folder, kind if isinstance(kind, type) and issubclass(kind, nn.Module) else None)
+    own: Any = kind if isinstance(kind, type) and issubclass(kind, nn.Module) else None
+    trained = load(run.folder, own)
     [task] = run.tasks
     share = taught_share(trained.policy_for(task), task, trained.agent.initial_state)
     return Measured(max(0.0, share), 0.0, 1.0)

@@ -48,7 +48,6 @@ SETTINGS = {
 }
 
 MAKE = {"maml": partial(MAML, **SETTINGS), "cavia": partial(CAVIA, num_context=3, **SETTINGS)}
-
 each = pytest.mark.parametrize("name", MAKE)
 cavia_always = pytest.mark.parametrize("name", others_slow(MAKE, "cavia"))
 
