@@ -90,9 +90,10 @@ class RecurrentQ(QLearner):
         require_replay(observation_spec, buffer_size, settings["batch_size"], pairs)
         super().__init__(**settings)
         self.trunk = recurrent(observation_spec, hidden_size, 1, num_actions, make_cell=cell, kind=encoder)
-        unstored = [key for key in self.trunk.state_keys if key.startswith(UNSTORED)]
-        message = f"{type(self).__name__} replays sequences, which need a cell whose state is stored, not {unstored}"
-        require((not unstored, f"{message}: use agent=lstm_ppo"))
+        stored = not any(key.startswith(UNSTORED) for key in self.trunk.state_keys)
+        kind = type(self.trunk.module[1]).__name__
+        message = f"{type(self).__name__} replays sequences, which need a cell whose state is stored, not {kind}"
+        require((stored, f"{message}: use agent=lstm_ppo"))
         head = Quantiles(hidden_size, num_actions, self.num_quantiles)
         values = TensorDictModule(head, in_keys=["memory"], out_keys=["action_value", "quantiles"])
         self.greedy = QValueActor(

@@ -209,6 +209,7 @@ def make_agent(
     method: str | None = None,
     method_settings: ReadOnlyValues | None = None,
     detector: str | None = None,
+    cell: str | None = None,
     device: torch.device | str | None = None,
     config_dir: Path | str | None = None,
     **settings: Any,
@@ -226,6 +227,7 @@ def make_agent(
         method: name of a file in ``conf/method``, such as ``"ewc"``; None: as on the command line.
         method_settings: values that replace those of the method's file, such as ``{"coeff": 50.0}``.
         detector: name of a file in ``conf/detector``, such as ``"swoks"``; None: without.
+        cell: name of a file in ``conf/cell``, such as ``"gru"``; None: as on the command line.
         device: where the agent lives; None: as on the command line.
         config_dir: a directory with files of the user, ``agent/NAME.yaml`` and ``method/NAME.yaml``.
         settings: values that replace those of the agent's file, such as ``learning_rate=0.001``.
@@ -241,7 +243,7 @@ def make_agent(
         256
     """
     require((isinstance(curriculum, Curriculum), f"curriculum must be a Curriculum, got {curriculum!r:.80}"))
-    names = {"agent": name, "method": method, "detector": detector}
+    names = {"agent": name, "method": method, "detector": detector, "cell": cell}
     cfg = config.with_names(names, None if config_dir is None else Path(config_dir))
     cfg.seed = cfg.seed if seed is None else seed
     cfg.device = cfg.device if device is None else str(device)

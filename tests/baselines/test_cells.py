@@ -307,7 +307,7 @@ def test_an_unstored_state_is_carried_and_learned_with_as_a_stored_one_and_kept_
 
 
 def test_a_cell_whose_state_is_not_stored_cannot_be_replayed():
-    with pytest.raises(ValueError, match=r"DRQN replays .* whose state is stored, not .*: use agent=lstm_ppo"):
+    with pytest.raises(ValueError, match=r"DRQN replays .* whose state is stored, not UnstoredSum: use agent=lstm_ppo"):
         agent_with(UnstoredSum, "drqn")
 
 

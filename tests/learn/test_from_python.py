@@ -27,6 +27,7 @@ from omegaconf import OmegaConf
 from omegaconf.basecontainer import BaseContainer
 
 import ctgraph_rl
+from baselines.cells.gru import GRU
 from baselines.methods.multitask import Multitask
 from ctgraph_rl import Block, Recorder, learn_curriculum, make_agent, scores
 from ctgraph_rl.checks import did_you_mean
@@ -74,6 +75,7 @@ def test_what_is_not_given_is_what_the_yaml_files_say():
     agent = make_agent("dqn", TASKS, num_envs=16, buffer_size=64, batch_size=8, num_steps=1)
 
     assert agent.gamma == composed(["agent=dqn"]).agent.gamma
+    assert isinstance(make_agent("lstm_ppo", TASKS, cell="gru", **SMALL).trunk.module[1], GRU)
     assert torch.get_num_threads() == composed([]).num_threads
 
 
@@ -90,6 +92,7 @@ def test_what_is_not_given_is_what_the_yaml_files_say():
         ("ppo", {"learning_rate": -1}, "learning_rate must be a number > 0, got -1"),
         ("ppo", {"seed": -1}, "seed must be an integer in "),
         ("ppo", {"device": "gpu"}, "device must be "),
+        ("ppo", {"cell": "gru"}, "PPO has no memory and takes no cell"),
         ("ppo", {"method": "mask_ri"}, "needs task ids, which are hidden"),
         ("ppo", {"method": "multitask"}, "Multitask learns another curriculum: replace yours by Multitask"),
         ("ppo", {"config_dir": "nowhere"}, "config_dir must be a directory, got nowhere"),
