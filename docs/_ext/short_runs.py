@@ -11,6 +11,7 @@ from studies.raw import mean_of, numbers_in
 
 from ctgraph_rl import Curriculum
 from ctgraph_rl.report.intervals import Bounds
+from ctgraph_rl.report.style import agent_style, frames_axis, style
 from ctgraph_rl.visualize.style import new_figure, save_figure
 
 NAME = "every_curriculum"
@@ -18,7 +19,8 @@ NAME = "every_curriculum"
 METHODS = {"finetune": "fine-tuning", "mask_ri": "Mask RI", "ewc": "EWC", "multitask": "multitask"}
 """Methods in the order of lines and figures, in words."""
 
-STYLES = dict(zip(METHODS, ("-", "--", ":", "-."), strict=True))
+WIDTHS = dict(zip(METHODS, (3.6, 2.6, 1.8, 1.0), strict=True))
+"""Widths of their lines: those below show where lines coincide."""
 
 STUDIES = {
     "baselines": ("penn_a_swap", "single_task", "su_b1_4tasks", "su_b1_changing_goals"),
@@ -101,19 +103,23 @@ def _known(line: Line) -> str:
     return f" {best} {float(line['optimum']):.3g}; random actions have {float(line['random']):.2g}."
 
 
+@style()
 def draw_curves(curriculum: Curriculum, path: Path) -> None:
-    """Draw the mean return over all tasks of each short run over its frames."""
+    """Draw the mean return over all tasks over the frames: the mean of the seeds of each method, and each seed."""
     figure = new_figure(6, 2.2)
     axes = figure.subplots()
     for (_, method), lines in lines_of(curriculum.name).items():
-        for number, line in enumerate(lines):
-            frames = [int(at) for at in line["at"].split()]
-            values = [float(value) for value in line["curve"].split()]
-            label = METHODS[method] if number == 0 else None
-            axes.plot(frames, values, STYLES[method], marker=".", color="0.2", lw=1, ms=3, label=label)
+        color = agent_style(list(METHODS).index(method), method)["color"]
+        frames = [int(at) for at in lines[0]["at"].split()]
+        curves = [list(map(float, line["curve"].split())) for line in lines]
+        for curve in curves:
+            axes.plot(frames, curve, "-", marker="", color=color, lw=0.5, alpha=0.6)
+        mean = [fmean(values) for values in zip(*curves, strict=True)]
+        axes.plot(frames, mean, "-", marker="", color=color, lw=WIDTHS[method], label=METHODS[method])
     optimum = next(iter(lines_of(curriculum.name).values()))[0]["optimum"]
     if optimum:
         axes.axhline(float(optimum), color="0.6", lw=0.8, label="optimum")
     axes.set(xlabel="frames", ylabel="mean return")
+    frames_axis(axes)
     axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
     save_figure(figure, path)
