@@ -19,7 +19,6 @@ from typing import Any
 import yaml
 
 from ctgraph_rl.checks import ReadOnlyValues, at_least_one, did_you_mean, is_int, require
-from ctgraph_rl.metrics import METRICS
 from ctgraph_rl.packages import conf_dir
 from ctgraph_rl.runs import config
 from ctgraph_rl.runs.job import with_changes
@@ -36,6 +35,9 @@ HELD_OUT_SEEDS = range(10**6, 2**31)
 
 KEYS = ("version", "title", "measures", "breakthrough", "score", "less_given")
 """What a file says under ``track``."""
+
+SCORES = ("average_performance", "memory_gap_closed", "normalised_performance")
+"""Metrics that can order a table: higher is better."""
 
 GROUP = "track"
 
@@ -218,8 +220,8 @@ def track(name: str, config_dir: Path | None = None) -> Track:
         (not missing, f"{file} must say track.{', track.'.join(missing)}"),
         ("seed" in values, f"{file} must have hydra.sweeper.params.seed, the seeds of a submission"),
         (
-            not missing and about["score"] in METRICS,
-            f"{file}: track.score must be a metric, got {about.get('score')!r}",
+            not missing and about["score"] in SCORES,
+            f"{file}: track.score must be one of {', '.join(SCORES)}, got {about.get('score')!r}",
         ),
     )
     seeds = tuple(int(setting.partition("=")[2]) for setting in values.pop("seed"))

@@ -115,6 +115,10 @@ def test_a_track_of_a_user_needs_all_parts(tmp_path):
         track("mine", tmp_path)
 
     full = "track: {version: 3, title: M, measures: m, breakthrough: b, score: average_performance, less_given: []}"
-    file.write_text(f"# @package _global_\n{full}\nhydra: {{sweeper: {{params: {{seed: '5,6'}}}}}}\n")
+    text = f"# @package _global_\n{full}\nhydra: {{sweeper: {{params: {{seed: '5,6'}}}}}}\n"
+    file.write_text(text.replace("average_performance", "forgetting"))
+    with pytest.raises(ValueError, match=r"track\.score must be one of average_performance, .* got 'forgetting'"):
+        track("mine", tmp_path)
+    file.write_text(text)
     own = track("mine", tmp_path)
     assert (own.id, own.seeds, own.curriculum.name) == ("mine-v3", (5, 6), "su_b1_4tasks")
