@@ -7,7 +7,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -107,12 +107,12 @@ def speed_suite(name: str) -> ModuleType:
 
 
 def import_agents(config_dir: Path) -> None:
-    """Import the modules of a user's agents, so that their runs can be loaded."""
+    """Import the modules of a user's agents, so that their runs can be loaded; what cannot be imported is left out."""
     import yaml
 
-    for path in config_dir.glob("agent/*.yaml"):
-        target = (yaml.safe_load(path.read_text(encoding="utf-8")) or {}).get("_target_")
-        if target is not None:
+    for path in config_dir.rglob("agent/**/*.yaml"):
+        with importing_from_here(), suppress(Exception):
+            target = yaml.safe_load(path.read_text(encoding="utf-8"))["_target_"]
             import_module(target.rpartition(".")[0])
 
 

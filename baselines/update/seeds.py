@@ -203,8 +203,9 @@ class SeedGroup:
             numbers = range(len(measured), len(measured) + len(stack.learners))
             measured += self._learn_at_once(stack, numbers, parts)
         for number, method in enumerate(self.methods):
-            with self.random(number):
-                method.after_learning()
+            if not isinstance(measured[number], FloatingPointError):
+                with self.random(number):
+                    method.after_learning()
         return measured
 
     def _learn_at_once(self, stack: Stack, numbers: Sequence[int], parts: Sequence[TensorDictBase]) -> list[Learnt]:

@@ -36,8 +36,11 @@ HELD_OUT_SEEDS = range(10**6, 2**31)
 KEYS = ("version", "title", "measures", "breakthrough", "score", "less_given")
 """What a file says under ``track``."""
 
-SCORES = ("average_performance", "memory_gap_closed", "normalised_performance")
-"""Metrics that can order a table: higher is better."""
+SCORES = (
+    *("adapted_return", "average_performance", "forward_transfer", "held_out_adapted_return", "memory_gap_closed"),
+    *("normalised_performance", "search_efficiency", "tasks_learned"),
+)
+"""Metrics that order a table; of each, more is better."""
 
 GROUP = "track"
 

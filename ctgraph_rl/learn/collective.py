@@ -116,7 +116,7 @@ def learn_collective(
     """Let the members of a collective learn in lock-step, a batch each in turn, with messages between batches.
 
     A member that takes over nothing has the bits of `learn_curriculum`. One that has finished its curriculum
-    still answers the others.
+    still answers the others, and takes over nothing.
 
     Args:
         members: the learners.

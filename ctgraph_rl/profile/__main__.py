@@ -20,7 +20,7 @@ FOLDER = "hydra.sweep.dir"
 
 
 def main() -> None:
-    """Train where there are settings, then write and print the profile; the exit code is 1 where runs are missing."""
+    """Train where there are settings, and print the profile; exit with 1 where cells are not done or runs left out."""
     parser = parsers.profile()
     arguments = parser.parse_args()
     settings = [word for word in arguments.words if "=" in word]
@@ -36,7 +36,7 @@ def main() -> None:
         folders.append(given[FOLDER])
         learned = given["curriculum"]
         with refused_by(parser):
-            require(("profile_" in learned, f"a profile learns curricula profile_*, got curriculum={learned}"))
+            require(("profile" in learned, f"a profile learns curricula profile_*, got curriculum={learned}"))
         complete = _train(given, arguments.config_dir)
     out = arguments.out or Path(folders[0], "profile")
     with refused_by(parser):

@@ -69,7 +69,7 @@ def profile_scores(paths: Sequence[Path | str], agents: Sequence[str] = ()) -> d
 
     Returns:
         For each agent its score by the title of each property; one without a run or a value says why. A modified
-        curriculum counts where there is no run of the published one, and the reason names it.
+        curriculum counts where the published one has no score, and the reason names it.
 
     Raises:
         ValueError: if there is no run of a profile curriculum.
@@ -86,10 +86,11 @@ def profile_scores(paths: Sequence[Path | str], agents: Sequence[str] = ()) -> d
         missing = {each.title: Score(None, reason="there is no run") for each in properties.values()}
         scores = found.setdefault(agent, missing)
         score = _over_seeds(by_seed, prop)
-        if MODIFIED not in curriculum:
+        is_modified = MODIFIED in curriculum
+        if is_modified:
+            score = score._replace(reason=f"of {curriculum}{score.reason and ': '}{score.reason}")
+        if not scores[prop.title].n or (score.n and not is_modified):
             scores[prop.title] = score
-        elif not scores[prop.title].n:
-            scores[prop.title] = score._replace(reason=f"of {curriculum}{score.reason and ': '}{score.reason}")
     return found
 
 

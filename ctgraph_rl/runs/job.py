@@ -229,7 +229,7 @@ def make_agent(
         detector: name of a file in ``conf/detector``, such as ``"swoks"``; None: without.
         cell: name of a file in ``conf/cell``, such as ``"gru"``; None: as on the command line.
         device: where the agent lives; None: as on the command line.
-        config_dir: a directory with files of the user, ``agent/NAME.yaml`` and ``method/NAME.yaml``.
+        config_dir: a directory with the user's ``agent/NAME.yaml``, ``method/NAME.yaml`` and ``cell/NAME.yaml``.
         settings: values that replace those of the agent's file, such as ``learning_rate=0.001``.
 
     Raises:

@@ -117,7 +117,7 @@ def test_a_track_of_a_user_needs_all_parts(tmp_path):
     full = "track: {version: 3, title: M, measures: m, breakthrough: b, score: average_performance, less_given: []}"
     text = f"# @package _global_\n{full}\nhydra: {{sweeper: {{params: {{seed: '5,6'}}}}}}\n"
     file.write_text(text.replace("average_performance", "forgetting"))
-    with pytest.raises(ValueError, match=r"track\.score must be one of average_performance, .* got 'forgetting'"):
+    with pytest.raises(ValueError, match=r"track\.score must be one of adapted_return, .* got 'forgetting'"):
         track("mine", tmp_path)
     file.write_text(text)
     own = track("mine", tmp_path)

@@ -271,13 +271,23 @@ def test_a_compiled_step_is_the_same_step_of_fewer_seeds_at_a_time(make, monkeyp
 
     monkeypatch.setattr(SeedGroup, "_step", compared)
     monkeypatch.setattr(together, "_most_at_once", lambda learner: 2)
-    ended = []
-    monkeypatch.setattr(Method, "after_learning", lambda method: ended.append((len(sizes), id(method))))
+    learnt, ended, batches = SeedGroup.learnt, [], []
+
+    def counted(group, batch):
+        ended.clear()
+        measured = learnt(group, batch)
+        batches.append([after - len(sizes) for after, _ in ended])
+        states = {random.numpy().tobytes() for _, random in ended}
+        assert len(states) == len(group.methods), "each with the random numbers of its seed"
+        return measured
+
+    monkeypatch.setattr(SeedGroup, "learnt", counted)
+    monkeypatch.setattr(Method, "after_learning", lambda method: ended.append((len(sizes), torch.get_rng_state())))
     its.learn()
 
     assert set(sizes) == {2, 1}, "of two seeds, and of the third"
-    assert len(set(ended)) == len(ended), "each method once a batch"
-    assert len({after for after, _ in ended}) == len(ended) / 3, "after the steps of all seeds"
+    once = [] if method == "finetune" else [0, 0, 0]
+    assert batches == [once] * len(batches), "each method once, after the steps of all seeds"
 
 
 def state_in_double(state):

@@ -211,6 +211,11 @@ def test_a_recorded_run_is_scored_and_what_was_not_run_is_a_gap(tmp_path):
     assert (scores["attention"].value, scores["attention"].reason) == (0, "of profile_attention (modified)")
     assert (scores["memory"].value, scores["memory"].reason) == (None, "there is no run")
 
+    with Recorder(curricula.load("profile_attention"), tmp_path / "begun", about={"agent": "Mine"}) as recorder:
+        recorder.evaluate(lambda images: torch.zeros(len(images), dtype=torch.int64), 0)
+    for folders in (["mine", "begun"], ["begun", "mine"]):
+        assert profile_scores([tmp_path / each for each in folders])["Mine"]["attention"].value == 0
+
 
 @pytest.mark.slow
 def test_the_command_trains_an_agent_of_the_user_scores_and_draws(tmp_path):
@@ -223,8 +228,11 @@ def test_the_command_trains_an_agent_of_the_user_scores_and_draws(tmp_path):
     start = "from ctgraph_rl.cli import main; main()"
 
     run = partial(subprocess.run, cwd=tmp_path, capture_output=True, text=True)  # where ``mine`` is found
-    done = run([sys.executable, "-c", start, *words])
+    (own.parent / "broken.yaml").write_text("- no agent")
+    done = run([sys.executable, "-P", "-c", start, *words])
+    scored = run([sys.executable, "-P", "-c", start, "profile", "--config-dir", "conf", "runs/profile"])
 
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == scored.returncode == 0, done.stderr + scored.stderr
+    assert scored.stdout.endswith(done.stdout[-200:])
     assert re.search(r"model +0\.\d\d  \(of profile_model \(modified\)\)", done.stdout)
     assert (tmp_path / "runs" / "profile" / "profile" / "figures" / "profile.png").is_file()
