@@ -22,6 +22,9 @@ METHODS = {"finetune": "fine-tuning", "mask_ri": "Mask RI", "ewc": "EWC", "multi
 WIDTHS = dict(zip(METHODS, (3.6, 2.6, 1.8, 1.0), strict=True))
 """Widths of their lines: those below show where lines coincide."""
 
+IDS = {"": "", "at_boundaries": ", with task ids", "hidden": ", without task ids"}
+"""What is said of runs with another ``protocol.task_id`` than their curriculum has."""
+
 STUDIES = {
     "baselines": ("penn_a_swap", "single_task", "su_b1_4tasks", "su_b1_changing_goals"),
     "lifelong": ("ct8", "ct8_md", "ct12", "fo_b1_4images", "fo_b1_4tasks", "fo_b1_depth2to5"),
@@ -86,11 +89,11 @@ def _reached(method: str, lines: list[Line]) -> str:
     """Return the mean return at the end with its interval, and right after each task's own block."""
     first = lines[0]
     bounds = Bounds(float(first["lowest"] or "-inf"), float(first["highest"] or "inf"), noisy=True)
-    ids = ", with task ids" if first["task_id"] else ""
+    ids = IDS[first["task_id"]]
     seeds = f"{len(lines)} seed{'s' * (len(lines) > 1)}"
     number = mean_of(numbers_in(lines, "end"), bounds)
     if not first["forgetting"]:
-        return f"{number} with {METHODS[method]} ({seeds}{ids})" if method != "finetune" else f"{number} ({seeds})"
+        return f"{number} with {METHODS[method]} ({seeds}{ids})" if method != "finetune" else f"{number} ({seeds}{ids})"
     own = fmean(numbers_in(lines, "learned"))
     return f"{number} with {METHODS[method]} ({seeds}{ids}; {own:.2f} right after each task)"
 

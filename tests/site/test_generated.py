@@ -119,8 +119,9 @@ def test_a_card_shows_its_short_runs_in_one_line_and_one_figure(site):
 
     line, figure = (part for part in results if part.strip())
     assert re.fullmatch(
-        r"`agent=ppo`, 102,400 instead of 204,800 frames a task\. Mean return over all tasks at the end: 0\.12.*"
-        r" with fine-tuning \(\d seeds?; \d\.\d\d right after each task\).* The optimum is 1; random actions have .*",
+        r"`agent=ppo`, 102,400 instead of 204,800 frames a task\. Mean return over all tasks at the end: 0\.04 .*"
+        r" with fine-tuning \(3 seeds; \d\.\d\d right after each task\); .* with Mask RI \(3 seeds, with task ids; .*"
+        r" with EWC \(3 seeds, with task ids; .* with multitask \(3 seeds\)\. The optimum is 1; random actions have .*",
         line,
     )
     assert figure == "![Mean return of short runs of fo_b2_8tasks](../figures/curves.png)"
