@@ -7,7 +7,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -106,14 +106,19 @@ def speed_suite(name: str) -> ModuleType:
         return import_module(f"benchmarks.{name}")
 
 
-def import_agents(config_dir: Path) -> None:
-    """Import the modules of a user's agents, so that their runs can be loaded; what cannot be imported is left out."""
+def import_agents(config_dir: Path) -> list[str]:
+    """Import the modules of a user's agents, so that their runs can be loaded; return why some were not."""
     import yaml
 
-    for path in config_dir.rglob("agent/**/*.yaml"):
-        with importing_from_here(), suppress(Exception):
+    problems = []
+    for path in config_dir.glob("agent/**/*.yaml"):
+        try:
             target = yaml.safe_load(path.read_text(encoding="utf-8"))["_target_"]
-            import_module(target.rpartition(".")[0])
+            with importing_from_here():
+                import_module(target.rpartition(".")[0])
+        except Exception as error:  # of the user's code
+            problems.append(f"the agent of {path} cannot be imported: {error}")
+    return problems
 
 
 def command(module: str) -> Callable[[], None]:

@@ -216,8 +216,7 @@ class Mosaic(MaskExchange):
     def state_dict(self) -> NamedValues:
         """Return returns, embeddings, transitions and the random stream."""
         known = [dict(vars(each)) for each in self.known]
-        values = {"known": known, "shape": self.shape, "random": self.generator.get_state()}
-        return {**super().state_dict(), **values}
+        return {**super().state_dict(), "known": known, "shape": self.shape, "random": self.generator.get_state()}
 
     def load_state_dict(self, state: ReadOnlyValues) -> None:
         """Restore what `state_dict` returned."""

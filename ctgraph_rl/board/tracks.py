@@ -37,8 +37,14 @@ KEYS = ("version", "title", "measures", "breakthrough", "score", "less_given")
 """What a file says under ``track``."""
 
 SCORES = (
-    *("adapted_return", "average_performance", "forward_transfer", "held_out_adapted_return", "memory_gap_closed"),
-    *("normalised_performance", "search_efficiency", "tasks_learned"),
+    "adapted_return",
+    "average_performance",
+    "forward_transfer",
+    "held_out_adapted_return",
+    "memory_gap_closed",
+    "normalised_performance",
+    "search_efficiency",
+    "tasks_learned",
 )
 """Metrics that order a table; of each, more is better."""
 

@@ -13,14 +13,14 @@ from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.packages import import_agents
 from ctgraph_rl.profile.profile_page import text_table, write_profile
 from ctgraph_rl.report.style import require_packages
-from ctgraph_rl.report.terminal import print_problems
+from ctgraph_rl.report.terminal import print_note, print_problems
 from ctgraph_rl.runs.read import find_runs
 
 FOLDER = "hydra.sweep.dir"
 
 
 def main() -> None:
-    """Train where there are settings, and print the profile; exit with 1 where cells are not done or runs left out."""
+    """Train where there are settings, and print the profile; the exit code is 1 if runs are not done or left out."""
     parser = parsers.profile()
     arguments = parser.parse_args()
     settings = [word for word in arguments.words if "=" in word]
@@ -41,7 +41,8 @@ def main() -> None:
     out = arguments.out or Path(folders[0], "profile")
     with refused_by(parser):
         if arguments.config_dir is not None:
-            import_agents(arguments.config_dir)
+            for problem in import_agents(arguments.config_dir):
+                print_note("left out", problem)
         scores = write_profile(folders, out, arguments.agent)
     runs, problems = find_runs(folders)
     complete = not print_problems(problems, runs) and complete

@@ -18,7 +18,8 @@ from ctgraph_rl.report.style import MOST_AGENTS, WIDTH, agent_style, new_figure,
 
 MEANING = (
     "A score is 0 at the floor of an agent without the property and 1 at the optimum. Intervals are at 95 % over "
-    "seeds; one seed has none, nor have equal ones. A dash is a gap: the agent was not measured there, which is no 0."
+    "seeds; one seed has none, and equal seeds have none where the floor is measured. A dash is a gap: the agent was "
+    "not measured there, which is no 0."
 )
 
 COLUMNS = ("agent", "property", "score", "low", "high", "n", "reason")

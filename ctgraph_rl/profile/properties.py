@@ -130,14 +130,19 @@ def teaches(run: Evidence) -> Measured:
 
     0 is a table of frequencies, 1 the exact model; see `baselines.models.model.learned_share`.
     """
-    config = run.log.of_kind("run")[0].get("config") or {}
-    module, _, name = str(config.get("agent", {}).get("_target_")).rpartition(".")
-    kind = getattr(sys.modules.get(module), name, None)
-    own: Any = kind if isinstance(kind, type) and issubclass(kind, nn.Module) else None
-    trained = load(run.folder, own)
+    trained = load(run.folder, _imported_class(run))
     [task] = run.tasks
     share = taught_share(trained.policy_for(task), task, trained.agent.initial_state)
     return Measured(max(0.0, share), 0.0, 1.0)
+
+
+def _imported_class(run: Evidence) -> Any:
+    """Return the class of a run's agent; None if its module is not imported, as nothing of a file is."""
+    config = run.log.of_kind("run")[0].get("config") or {}
+    module, _, name = str(config.get("agent", {}).get("_target_")).rpartition(".")
+    kind = getattr(sys.modules.get(module), name, None)
+    is_agent = isinstance(kind, type) and kind.__module__ == module and issubclass(kind, nn.Module)
+    return kind if is_agent else None
 
 
 MEASURES: Mapping[str, Callable[..., Measured]] = by_name(

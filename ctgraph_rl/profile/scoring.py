@@ -88,7 +88,7 @@ def profile_scores(paths: Sequence[Path | str], agents: Sequence[str] = ()) -> d
         score = _over_seeds(by_seed, prop)
         is_modified = MODIFIED in curriculum
         if is_modified:
-            score = score._replace(reason=f"of {curriculum}{score.reason and ': '}{score.reason}")
+            score = score._replace(reason=": ".join(filter(None, [f"of {curriculum}", score.reason])))
         if not scores[prop.title].n or (score.n and not is_modified):
             scores[prop.title] = score
     return found

@@ -93,7 +93,8 @@ def _reached(method: str, lines: list[Line]) -> str:
     seeds = f"{len(lines)} seed{'s' * (len(lines) > 1)}"
     number = mean_of(numbers_in(lines, "end"), bounds)
     if not first["forgetting"]:
-        return f"{number} with {METHODS[method]} ({seeds}{ids})" if method != "finetune" else f"{number} ({seeds}{ids})"
+        named = "" if method == "finetune" else f" with {METHODS[method]}"
+        return f"{number}{named} ({seeds}{ids})"
     own = fmean(numbers_in(lines, "learned"))
     return f"{number} with {METHODS[method]} ({seeds}{ids}; {own:.2f} right after each task)"
 

@@ -271,7 +271,9 @@ def test_a_compiled_step_is_the_same_step_of_fewer_seeds_at_a_time(make, monkeyp
 
     monkeypatch.setattr(SeedGroup, "_step", compared)
     monkeypatch.setattr(together, "_most_at_once", lambda learner: 2)
-    learnt, ended, batches = SeedGroup.learnt, [], []
+    learnt = SeedGroup.learnt
+    ended = []
+    batches = []
 
     def counted(group, batch):
         ended.clear()

@@ -234,5 +234,6 @@ def test_the_command_trains_an_agent_of_the_user_scores_and_draws(tmp_path):
 
     assert done.returncode == scored.returncode == 0, done.stderr + scored.stderr
     assert scored.stdout.endswith(done.stdout[-200:])
+    assert "left out: the agent of conf/agent/broken.yaml cannot be imported" in scored.stderr
     assert re.search(r"model +0\.\d\d  \(of profile_model \(modified\)\)", done.stdout)
     assert (tmp_path / "runs" / "profile" / "profile" / "figures" / "profile.png").is_file()
