@@ -211,10 +211,24 @@ def test_a_recorded_run_is_scored_and_what_was_not_run_is_a_gap(tmp_path):
     assert (scores["attention"].value, scores["attention"].reason) == (0, "of profile_attention (modified)")
     assert (scores["memory"].value, scores["memory"].reason) == (None, "there is no run")
 
-    with Recorder(curricula.load("profile_attention"), tmp_path / "begun", about={"agent": "Mine"}) as recorder:
-        recorder.evaluate(lambda images: torch.zeros(len(images), dtype=torch.int64), 0)
-    for folders in (["mine", "begun"], ["begun", "mine"]):
-        assert profile_scores([tmp_path / each for each in folders])["Mine"]["attention"].value == 0
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_modified_curriculum_counts_where_the_published_one_has_no_score(tmp_path, order):
+    def record(name: str, at: int | None, **changes: int) -> Path:
+        curriculum = curricula.load("profile_attention", **changes)
+        with Recorder(curriculum, tmp_path / name, about={"agent": "Mine"}) as recorder:
+            if at is not None:
+                recorder.evaluate(lambda images: torch.zeros(len(images), dtype=torch.int64), at)
+        return tmp_path / name
+
+    modified = record("modified", 1024, num_frames=1024)
+    begun = record("begun", None)
+    published = record("published", 0)
+
+    reasons = []
+    for other in (begun, published):
+        reasons.append(profile_scores([modified, other][::order])["Mine"]["attention"].reason)
+    assert reasons == ["of profile_attention (modified)", ""]
 
 
 @pytest.mark.slow
