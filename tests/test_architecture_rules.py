@@ -127,34 +127,6 @@ importlib.util.find_spec(name)
     ]
 
 
-def test_full_folders_and_long_files_are_found():
-    found = modules(core__a="", core__b="", core__c="\n" * 3, tasks__d="", tasks__e="")
-    found += read({"ctgraph_rl.tasks.__init__": ""})
-
-    assert architecture.full_folders(found, 2, []) == ["ctgraph_rl.core: 3 modules"]
-    assert architecture.full_folders(found, 2, ["ctgraph_rl.core"]) == []
-    assert architecture.long_files(found, 2, []) == ["ctgraph_rl.core.c"]
-    assert architecture.long_files(found, 2, ["ctgraph_rl.core.c"]) == []
-
-
-def test_long_functions_are_found_without_comments_and_docstrings():
-    text = """
-def short():
-    'A text.'
-    # a comment
-    return 1
-
-class C:
-    def long(self):
-        a = 1
-        return a
-"""
-    found = modules(core__a=text)
-
-    assert [module.functions for module in found if module.name == "ctgraph_rl.core.a"] == [(("short", 2), ("long", 5))]
-    assert architecture.long_functions(found, 4) == ["ctgraph_rl.core.a.long"]
-
-
 def test_a_call_with_too_many_positional_arguments_is_found():
     found = modules(here="f(1, 2, 3)\ng.h(1, 2, *rest)\nf(1, 2, c=3)\nrequire(1, 2, 3)")
 
@@ -233,7 +205,3 @@ def test_a_test_that_imports_a_test_is_found(text):
     found = read({"tests.test_a": text, "tests.test_b": "import pytest\nfrom helpers import oracles", "conftest": ""})
 
     assert [finding.partition(":")[0] for finding in architecture.tests_that_import_tests(found)] == ["tests.test_a"]
-
-
-def test_an_f_string_is_one_token_on_every_python():
-    assert list(architecture.lines_of_tokens('a = f"{x + 1:{w}} b" f"""{y}\n{z}"""\nb\n')) == [1, 1, 1, 1, 3]

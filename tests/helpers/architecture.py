@@ -6,11 +6,7 @@ A rule takes modules and returns its findings, one text for each place that brea
 from __future__ import annotations
 
 import ast
-import io
 import re
-import tokenize
-from bisect import bisect_left, bisect_right
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -57,7 +53,6 @@ class Module:
 
     name: str
     is_folder: bool
-    num_lines: int
     docstring: str
     imports: tuple[Import, ...] = ()
     calls: tuple[tuple[str, int], ...] = ()
@@ -69,18 +64,11 @@ class Module:
     private: tuple[str, ...] = ()
     """Private names of other modules of ours that it uses."""
 
-    functions: tuple[tuple[str, int], ...] = ()
-    """Functions and how many tokens of code their bodies have, without comments and docstrings."""
-
     starred: tuple[str, ...] = ()
     """Functions that star into a call a dict of literal keys that they made for it."""
 
     classes: tuple[str, ...] = ()
     """Public classes and aliases of types."""
-
-    @property
-    def folder(self) -> str:
-        return self.name if self.is_folder else self.name.rpartition(".")[0]
 
 
 @dataclass
@@ -183,7 +171,7 @@ def read(sources: Mapping[str, str], with_bodies: bool = True) -> list[Module]:
 
     Args:
         sources: texts by the names of their modules.
-        with_bodies: whether to look for more than imports: for calls, functions, starred dicts and public classes.
+        with_bodies: whether to look for more than imports: for calls, starred dicts and public classes.
     """
     names = {name.removesuffix(".__init__") for name in sources}
     modules = [_module(name, text, names.__contains__, with_bodies) for name, text in sources.items()]
@@ -210,7 +198,6 @@ def _module(name: str, text: str, is_module: Callable[[str], bool], with_bodies:
     found = Module(
         name.removesuffix(".__init__"),
         name.endswith(".__init__"),
-        len(lines),
         ast.get_docstring(tree) or "",
         imports=tuple(reader.imports),
         calls=tuple(reader.calls),
@@ -222,7 +209,6 @@ def _module(name: str, text: str, is_module: Callable[[str], bool], with_bodies:
     functions = [node for node in ast.walk(tree) if isinstance(node, FUNCTION)]
     return replace(
         found,
-        functions=tuple(_sizes_of_functions(functions, text)),
         starred=tuple(_starred_dicts(functions)),
         classes=tuple(_public_classes(tree)),
     )
@@ -266,30 +252,6 @@ def _public_classes(tree: ast.Module) -> Iterator[str]:
             name = ast.unparse(node.targets[0])
         if re.fullmatch(r"[A-Z]+[a-z]\w*", name):
             yield name
-
-
-NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
-
-
-def lines_of_tokens(text: str) -> Iterator[int]:
-    """The line of each token of code. An f-string is one token, also where Python 3.12 and newer give its parts."""
-    depth = 0
-    for token in tokenize.generate_tokens(io.StringIO(text).readline):
-        if token.type not in NO_CODE and depth == 0:
-            yield token.start[0]
-        depth += {"FSTRING_START": 1, "FSTRING_END": -1}.get(tokenize.tok_name[token.type], 0)
-
-
-def _sizes_of_functions(functions: Iterable[ast.FunctionDef], text: str) -> list[tuple[str, int]]:
-    """Functions and the number of tokens in their bodies."""
-    lines = list(lines_of_tokens(text))
-    sizes = []
-    for node in functions:
-        body = node.body if ast.get_docstring(node) is None else node.body[1:]
-        if body:
-            size = bisect_right(lines, body[-1].end_lineno) - bisect_left(lines, body[0].lineno)
-            sizes.append((node.name, size))
-    return sizes
 
 
 def find_sources(*folders: str, root: Path = CHECKOUT) -> dict[str, str]:
@@ -422,28 +384,6 @@ def imported_by_name(modules: Iterable[Module], doors: Iterable[str]) -> list[st
     """Modules besides some doors that import one of our packages by its name, or what the source does not say."""
     found = ((module.name, name) for module in modules if module.name not in doors for name in module.by_name)
     return sorted({f"{where}: {name or '?'}" for where, name in found if name is None or Import(name).is_ours})
-
-
-def full_folders(modules: Iterable[Module], most: int, catalogues: Iterable[str]) -> list[str]:
-    """Folders besides catalogues of more modules than allowed; their ``__init__`` does not count."""
-    sizes = Counter(module.folder for module in modules if not module.is_folder)
-    full = {folder: size for folder, size in sizes.items() if size > most and folder not in catalogues}
-    return sorted(f"{folder}: {size} modules" for folder, size in full.items())
-
-
-def long_files(modules: Iterable[Module], most: int, exceptions: Iterable[str]) -> list[str]:
-    return sorted(module.name for module in modules if module.num_lines > most and module.name not in exceptions)
-
-
-def long_functions(modules: Iterable[Module], most: int) -> list[str]:
-    """Functions of more tokens than allowed."""
-    return sorted(f"{module.name}.{name}" for module in modules for name, size in module.functions if size > most)
-
-
-def p90_of_functions(modules: Iterable[Module]) -> int:
-    """The tokens that at most one function in ten exceeds."""
-    sizes = sorted(size for module in modules for _, size in module.functions)
-    return sizes[9 * len(sizes) // 10]
 
 
 def starred_dicts(modules: Iterable[Module]) -> list[str]:

@@ -32,18 +32,18 @@ PAGES = {
 }
 
 
-def test_readme_and_all_pages_have_at_most_50_000_words_with_code_and_tables():
+def test_readme_and_all_pages_have_at_most_58_000_words_with_code_and_tables():
     """As ``wc -w`` counts them: marks of tables are words, too."""
     files = [path for path in sources((".md",)) if path.relative_to(CHECKOUT).parts[0] in ("README.md", "docs")]
     counts = [len(path.read_text(encoding="utf-8").split()) for path in files if "templates" not in path.parts]
 
     assert len(counts) > 70
-    assert sum(counts) <= 50_000
+    assert sum(counts) <= 58_000
 
 
-def test_all_pages_and_notebooks_have_at_most_41_000_words_and_numbers_outside_of_code():
+def test_all_pages_and_notebooks_have_at_most_48_000_words_and_numbers_outside_of_code():
     assert len(PAGES) > 70
-    assert sum(words(text, "[A-Za-z0-9]") for text in PAGES.values()) <= 41_000
+    assert sum(words(text, "[A-Za-z0-9]") for text in PAGES.values()) <= 48_000
 
 
 def test_a_page_has_at_most_1_700_words_and_a_page_of_results_1_200_outside_of_tables_and_folds():
