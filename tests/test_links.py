@@ -45,6 +45,7 @@ ALLOWED = {
     ("ctgraph_rl.log.files", "file.truncate"): "a file that open_own opened",
     ("ctgraph_rl.log.refuse", "os.open"): "the null device, in place of a broken pipe",
     ("ctgraph_rl.log.run_log", "file.truncate"): "as above",
+    ("ctgraph_rl.report.page", "folder.mkdir"): "named by the user",
     ("ctgraph_rl.runs.checkpoints", "each.save"): "a method of Checkpoints, which writes through ctgraph_rl.disk",
     ("ctgraph_rl.runs.sweep", "folder.mkdir"): "named by the user",
     ("ctgraph_rl.runs.seeds", "folder.mkdir"): "as above",

@@ -42,7 +42,7 @@ from ctgraph_rl.board.tracks import Track, track
 from ctgraph_rl.checks import ReadOnlyValues, Rule, repeated, require
 from ctgraph_rl.disk import made_folder, new_folder, require_new, write_whole
 from ctgraph_rl.log.escape import listed, terminal_text
-from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG
+from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG, locked_new
 from ctgraph_rl.log.provenance import machine
 from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.log.run_log import RunLog
@@ -78,6 +78,7 @@ def submit(
     Raises:
         ValueError: for runs that cannot be submitted; names every broken rule, before anything is written.
         FileExistsError: if the folder exists.
+        BlockingIOError: if another process makes it.
         ModuleNotFoundError: without pyarrow; names the extra to install.
     """
     require_parquet()
@@ -92,7 +93,8 @@ def submit(
     about["track"] = None
     if of_track is not None:
         about |= {"track": of_track.name, "track_version": of_track.version}
-    with new_folder(to) as folder:
+    made_folder(to.absolute().parent)
+    with locked_new(to), new_folder(to) as folder:
         _write(folder, runs, lines, about, curriculum=curriculum)
         made = read_submission(folder, of_track)
         wrong = [check.text for check in rescore(made) if not check.passed]

@@ -33,6 +33,7 @@ from ctgraph_rl.checks import NamedValues, Rule, is_int, is_real, require
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.learn.progress import ProgressBar
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
+from ctgraph_rl.log.files import locked
 from ctgraph_rl.log.provenance import machine, versions
 from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.log.sources import is_ours, targets
@@ -347,7 +348,10 @@ def verify(submission: Submission, arguments: argparse.Namespace) -> list[Check]
     )
     means = Means(isolated, arguments.hours, memory=arguments.memory, disk=arguments.disk, paths=paths)
     ask(describe_plan(plan, means), arguments.yes)
-    with _ended_by_signals(f"interrupted, and no process is left; with --number {number} the same command resumes"):
+    with (
+        locked(folder),
+        _ended_by_signals(f"interrupted, and no process is left; with --number {number} the same command resumes"),
+    ):
         checks += checks_of_plan(plan, run_plan(plan, means))
     write_verification(submission, checks, plan, means)
     return checks

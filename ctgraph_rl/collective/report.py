@@ -14,6 +14,7 @@ from ctgraph_rl.checks import NamedValues, require
 from ctgraph_rl.collective.summary import COLLECTIVE, RUN, WHAT, Collective, read_collective, tables
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.log.escape import csv_text, markdown_table, markdown_text
+from ctgraph_rl.log.files import locked
 from ctgraph_rl.metrics.record import MASTERED
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, Gallery
 from ctgraph_rl.report.style import MOST_AGENTS, WIDTH, agent_style, new_figure, require_packages, short
@@ -68,21 +69,23 @@ def write_report(paths: Sequence[Path | str], folder: Path) -> Path:
     Raises:
         ModuleNotFoundError: before any work, without what the extra ``report`` installs.
         ValueError: if there is no collective, or one cannot be read.
+        BlockingIOError: if another process writes into the folder.
     """
     require_packages()
     found = find_collectives(paths)
-    gallery = Gallery(made_folder(folder))
-    for name, columns, rows in tables(found):
-        write_whole(folder / name, csv_text([columns, *rows]))
-    measured = [_row(each) for each in found]
-    cells = map(itemgetter(*COLUMNS), measured)
-    write_whole(folder / "collectives.csv", csv_text([COLUMNS, *cells]))
-    shown = [[markdown_text(_shown(row[name])) for name in SHOWN] for row in measured]
-    parts = ["# Collectives", markdown_table(SHOWN, shown), MEANING]
-    for each in gallery.write((), _figures(found)):
-        parts.append(f"![{each.alt}]({each.path})\n\n{each.caption}")
-    page = folder / "collectives.md"
-    write_whole(page, "\n\n".join(parts) + "\n")
+    with locked(made_folder(folder)):
+        gallery = Gallery(folder)
+        for name, columns, rows in tables(found):
+            write_whole(folder / name, csv_text([columns, *rows]))
+        measured = [_row(each) for each in found]
+        cells = map(itemgetter(*COLUMNS), measured)
+        write_whole(folder / "collectives.csv", csv_text([COLUMNS, *cells]))
+        shown = [[markdown_text(_shown(row[name])) for name in SHOWN] for row in measured]
+        parts = ["# Collectives", markdown_table(SHOWN, shown), MEANING]
+        for each in gallery.write((), _figures(found)):
+            parts.append(f"![{each.alt}]({each.path})\n\n{each.caption}")
+        page = folder / "collectives.md"
+        write_whole(page, "\n\n".join(parts) + "\n")
     return page
 
 

@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import BinaryIO
+from weakref import WeakSet
 
 from ctgraph_rl.disk import open_own
 
@@ -33,7 +34,10 @@ WITH_LOCKS = (
 )
 
 SECONDS_BETWEEN_ATTEMPTS = 0.5
-"""To get a lock that another process has."""
+"""To get a lock that another writer has."""
+
+ATTEMPTS_TO_READ = 10
+"""Who has a lock, within half a second."""
 
 
 def member_folder(folder: Path, number: int) -> Path:
@@ -48,26 +52,58 @@ def list_members(folder: Path) -> list[Path]:
 
 @contextmanager
 def locked(folder: Path, waiting: Callable[[], object] | None = None) -> Iterator[None]:
-    """Keep other processes out of a directory; the lock ends with the process, however that ends.
+    """Keep all other writers out of a directory, those of this process too; the lock ends with the process at last.
 
     Args:
         folder: an existing directory, on a file system with POSIX locks.
-        waiting: called every half second while another process works there; None fails at once instead.
+        waiting: called every half second while another writer is there; None fails at once instead.
 
     Raises:
-        BlockingIOError: if another process works there; names its host, number and start.
+        BlockingIOError: if another writer is there; names its host, process and start.
         OSError: if the file system has no locks.
     """
-    file = _lock(folder / LOCK, waiting)
-    try:
+    with _locked(folder / LOCK, folder, waiting):
         yield
-    finally:
-        if _is_still_there(file, folder / LOCK):  # not where the folder was moved, and another is in its place
-            (folder / LOCK).unlink(missing_ok=True)
+
+
+@contextmanager
+def locked_new(folder: Path) -> Iterator[None]:
+    """Keep all other writers from making a folder, by a lock beside it, where the folder to come has a parent.
+
+    Raises:
+        BlockingIOError, OSError: see `locked`.
+    """
+    with _locked(folder.parent / f".{folder.name}{LOCK}", folder, None):
+        yield
+
+
+_held: WeakSet[BinaryIO] = WeakSet()
+"""The lock files of this process."""
+
+
+def _close_copies() -> None:
+    """Close the lock files that a forked process has of its parent, whose lock would last until both have ended."""
+    for file in [*_held]:
         file.close()
 
 
-def _lock(path: Path, waiting: Callable[[], object] | None) -> BinaryIO:
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_close_copies)
+
+
+@contextmanager
+def _locked(path: Path, folder: Path, waiting: Callable[[], object] | None) -> Iterator[None]:
+    file = _lock(path, folder, waiting)
+    _held.add(file)
+    try:
+        yield
+    finally:
+        if not file.closed and _is_still_there(file, path):  # not a fork's, nor where another folder is in its place
+            path.unlink(missing_ok=True)
+        file.close()
+
+
+def _lock(path: Path, folder: Path, waiting: Callable[[], object] | None) -> BinaryIO:
     """The open and locked file."""
     while True:
         file = open_own(path, "ab+")
@@ -76,9 +112,7 @@ def _lock(path: Path, waiting: Callable[[], object] | None) -> BinaryIO:
                 if _is_still_there(file, path):
                     return _signed(file)
             elif waiting is None:
-                file.seek(0)
-                holder = file.read().decode(errors="replace") or "another process"
-                raise BlockingIOError(f"{path.parent} is in use by {holder}; wait for it, or stop it")
+                raise BlockingIOError(f"{folder} is in use by {_holder(file)}")
             else:
                 waiting()
                 time.sleep(SECONDS_BETWEEN_ATTEMPTS)
@@ -86,6 +120,24 @@ def _lock(path: Path, waiting: Callable[[], object] | None) -> BinaryIO:
             file.close()
             raise
         file.close()
+
+
+def _holder(file: BinaryIO) -> str:
+    """Who has signed a lock file, and what to do about it."""
+    signature = b""
+    for _ in range(ATTEMPTS_TO_READ):  # it is signed right after it is locked
+        file.seek(0)
+        signature = file.read()
+        if signature:
+            break
+        time.sleep(SECONDS_BETWEEN_ATTEMPTS / ATTEMPTS_TO_READ)
+    holder = signature.decode(errors="replace") or "another process"
+    fix = f"{holder}; wait for it, or stop it"
+    return f"{fix}: it is this process, close its Recorder or del it" if holder.startswith(_signature()) else fix
+
+
+def _signature() -> str:
+    return f"process {os.getpid()} on {socket.gethostname()} "
 
 
 def _is_locked(file: BinaryIO) -> bool:
@@ -117,7 +169,7 @@ def _signed(file: BinaryIO) -> BinaryIO:
     now = datetime.now(UTC).isoformat(timespec="seconds")
     file.truncate(0)
     with suppress(OSError):
-        file.write(f"process {os.getpid()} on {socket.gethostname()} since {now}".encode())
+        file.write(f"{_signature()}since {now}".encode())
     return file
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.log.escape import csv_text, markdown_table, markdown_text
+from ctgraph_rl.log.files import locked
 from ctgraph_rl.profile.scoring import Profiles, Score, profile_scores
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, Gallery, left_out
 from ctgraph_rl.report.latex import PREAMBLE, Table, TableCell, latex
@@ -36,10 +37,10 @@ def write_profile(paths: Sequence[Path | str], folder: Path | str, agents: Seque
     Raises:
         ModuleNotFoundError: before any work, without what the extra ``report`` installs.
         ValueError: see `profile_scores`.
+        BlockingIOError: if another process writes into the folder.
     """
     require_packages()
     scores = profile_scores(paths, agents)
-    folder = made_folder(Path(folder))
     titles = list(next(iter(scores.values())))
     rows: list[Sequence[Any]] = [COLUMNS]
     cells = []
@@ -50,14 +51,16 @@ def write_profile(paths: Sequence[Path | str], folder: Path | str, agents: Seque
             rows.append((agent, title, *each))
             if each.reason:
                 gaps.append(markdown_text(f"{agent}, {title}: {each.reason}"))
-    write_whole(folder / "profile.csv", csv_text(rows))
-    table = Table(f"Profile. {MEANING}", "profile", "agent", titles, cells)
-    write_whole(folder / "profile.tex", f"{PREAMBLE}\n\n{latex(table)}\n")
-    [drawn] = Gallery(folder).write((), _figures(scores, titles))  # which draws them in the report's style
-    by_title = zip(titles, *(map(str, of_agent.values()) for of_agent in scores.values()), strict=True)
-    by_agent = markdown_table(["property", *map(markdown_text, scores)], by_title)
-    page = ["# Profile", f"![{drawn.alt}]({drawn.path})", drawn.caption, by_agent, *gaps]
-    write_whole(folder / "profile.md", "\n\n".join(page) + "\n")
+    folder = made_folder(Path(folder))
+    with locked(folder):
+        write_whole(folder / "profile.csv", csv_text(rows))
+        table = Table(f"Profile. {MEANING}", "profile", "agent", titles, cells)
+        write_whole(folder / "profile.tex", f"{PREAMBLE}\n\n{latex(table)}\n")
+        [drawn] = Gallery(folder).write((), _figures(scores, titles))  # which draws them in the report's style
+        by_title = zip(titles, *(map(str, of_agent.values()) for of_agent in scores.values()), strict=True)
+        by_agent = markdown_table(["property", *map(markdown_text, scores)], by_title)
+        page = ["# Profile", f"![{drawn.alt}]({drawn.path})", drawn.caption, by_agent, *gaps]
+        write_whole(folder / "profile.md", "\n\n".join(page) + "\n")
     return scores
 
 

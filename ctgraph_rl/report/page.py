@@ -12,6 +12,7 @@ from ctgraph_rl import __version__
 from ctgraph_rl.checks import require
 from ctgraph_rl.disk import is_writable, made_folder, write_whole
 from ctgraph_rl.learn.progress import Count, silent
+from ctgraph_rl.log.files import locked
 from ctgraph_rl.report import formats, results
 from ctgraph_rl.report.figures.adaptation import adaptation_curves
 from ctgraph_rl.report.figures.aggregates import improvements, profiles
@@ -124,6 +125,7 @@ def write_report(
     Raises:
         ModuleNotFoundError: before any work, without what the extra ``report`` installs.
         ValueError: if there is no run that can be read, and for a width, an agent or a colour that there is not.
+        BlockingIOError: if another process writes into the folder.
     """
     require_packages()
     runs, problems = find_runs(paths, count)
@@ -137,32 +139,35 @@ def write_report(
         folder = made_folder(Path(paths[0]) / "report" if within else Path("report"))
     found = sections(runs, count)
     most = _most_figures(found)
-    gallery = Gallery(Path(folder), width, chosen, lambda done: count("figures", done, most))
-    together = gallery.write((), map(experiments, [found]))  # drawn in the gallery's style
-    parts = []
-    missing: list[Run] = []
-    for section in found:
-        parts.append(_part(section, gallery))
-        missing += [run for run in section.runs if run.reason is not None]
-    page = Path(folder) / "report.html"
-    for file in (page, page.with_suffix(".md")):
-        text = rendered(
-            Path(__file__).with_name(f"{file.name}.j2"),
-            title=_title(parts),
-            figures=together,
-            smallest="44rem" if width == "text" else "0",
-            parts=parts,
-            problems=problems,
-            code=[*mixed_code(runs), *code_notes(runs), *label_notes(runs)],
-            legend=formats.LEGEND,
-            legend_of_means=formats.MEANS,
-            definitions=_definitions(parts),
-            version=__version__,
-            missing=missing,
-            num_runs=len(runs),
-        )
-        write_whole(file, text)
-    write_whole(Path(folder) / "tables.tex", _latex(parts))
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    with locked(folder):
+        gallery = Gallery(folder, width, chosen, lambda done: count("figures", done, most))
+        together = gallery.write((), map(experiments, [found]))  # drawn in the gallery's style
+        parts = []
+        missing: list[Run] = []
+        for section in found:
+            parts.append(_part(section, gallery))
+            missing += [run for run in section.runs if run.reason is not None]
+        page = folder / "report.html"
+        for file in (page, page.with_suffix(".md")):
+            text = rendered(
+                Path(__file__).with_name(f"{file.name}.j2"),
+                title=_title(parts),
+                figures=together,
+                smallest="44rem" if width == "text" else "0",
+                parts=parts,
+                problems=problems,
+                code=[*mixed_code(runs), *code_notes(runs), *label_notes(runs)],
+                legend=formats.LEGEND,
+                legend_of_means=formats.MEANS,
+                definitions=_definitions(parts),
+                version=__version__,
+                missing=missing,
+                num_runs=len(runs),
+            )
+            write_whole(file, text)
+        write_whole(folder / "tables.tex", _latex(parts))
     return Report(page, runs, problems)
 
 

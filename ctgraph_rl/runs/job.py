@@ -39,7 +39,7 @@ from ctgraph_rl.runs.train import (
     is_whole,
     new_agent,
     remove_results,
-    train,
+    train_alone,
     with_method,
 )
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -89,7 +89,7 @@ class Job:
     def learn(self, run_dir: Path) -> None:
         """Learn into a directory; the single-task experts first, where the configuration asks for them."""
         with self.prepared(run_dir) as where:
-            self._train(self.curriculum, self.agent, where)
+            train_alone(self.curriculum, self.agent, where, self.cfg.seed, self.device)
 
     @contextmanager
     def prepared(
@@ -151,7 +151,7 @@ class Job:
         agent, where = self.expert(alone, run_dirs[self.cfg.seed])
         if is_of_group(where.run_dir) and where.checkpoints.newest_frames != alone.num_frames:
             where.checkpoints.clear()
-        self._train(alone, agent, where)
+        train_alone(alone, agent, where, self.cfg.seed, self.device)
         return {}
 
     def _experts(self) -> list[Expert]:
@@ -160,21 +160,6 @@ class Job:
         keys = {self.cfg.seed: self.decides_experts}
         found, _ = find_or_train(self.curriculum, self.learn_alone, folder, keys, print, waiting=self.interrupt.check)
         return found[self.cfg.seed]
-
-    def _train(self, curriculum: Curriculum, agent: Agent, where: RunDirectory) -> None:
-        """Train into a directory, with checkpoints."""
-        train(
-            curriculum,
-            agent,
-            where.run_dir,
-            self.cfg.seed,
-            self.device,
-            config=where.config,
-            checkpoints=where.checkpoints,
-            experts=where.experts,
-            listeners=where.listeners,
-            console=where.console,
-        )
 
     def _checkpoints(self, run_dir: Path) -> Checkpoints:
         strict = self.cfg.resume == "strict"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from types import FunctionType
 from typing import Any
@@ -20,11 +21,11 @@ from ctgraph_rl.checks import (
     takes_numbers,
     true_or_false,
 )
-from ctgraph_rl.disk import made_folder, sync_folders
+from ctgraph_rl.disk import is_writable, made_folder, sync_folders
 from ctgraph_rl.learn.adapt import adapt
 from ctgraph_rl.learn.collect import Policy, agent_specs
 from ctgraph_rl.learn.evaluate import Evaluator, by_slices
-from ctgraph_rl.log.files import CHECKPOINTS, LOG, METRICS
+from ctgraph_rl.log.files import CHECKPOINTS, LOG, METRICS, locked
 from ctgraph_rl.log.provenance import code_changes, provenance
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.scores import scores
@@ -90,6 +91,7 @@ class Recorder:
         ValueError: for values out of range, before anything is written; and where a run of other settings or of code
             that has changed would be resumed.
         FileExistsError: if the directory holds a run, and neither ``overwrite`` nor ``resume`` says what to do with it.
+        BlockingIOError: if another writer is in the directory, such as a recorder that was not closed.
 
     Example:
         >>> import curricula
@@ -145,6 +147,7 @@ class Recorder:
         self._evaluated = -1
         self._trained = 0
         self._tracker: Tracker | None = None
+        self._lock: ExitStack | None = None  # of the directory, while this writes into it
         names = None if code is None else [full_name(each) for each in code]
         self._about = {**provenance(curriculum, names), "config": {"seed": seed, **(about or {})}}
         if self.run_dir is None:
@@ -153,10 +156,16 @@ class Recorder:
         else:
             make_logger = logger_of(logger)
             self._checkpoints = Checkpoints(self.run_dir / CHECKPOINTS, checkpoint_seconds)
-            self.log = self._opened(self.run_dir, overwrite, resume)
-            if not self.finished and make_logger is not None:
-                self._tracker = Tracker(make_logger, self.run_dir, dict(flat(self._about["config"])))
-                self.log.listeners.append(self._tracker)
+            is_read_only = resume and (self.run_dir / METRICS).exists() and not is_writable(self.run_dir)
+            with ExitStack() as stack:
+                if not is_read_only:  # else no process can write
+                    stack.enter_context(locked(made_folder(self.run_dir)))
+                self.log = self._opened(self.run_dir, overwrite, resume)
+                if not self.finished:
+                    if make_logger is not None:
+                        self._tracker = Tracker(make_logger, self.run_dir, dict(flat(self._about["config"])))
+                        self.log.listeners.append(self._tracker)
+                    self._lock = stack.pop_all()
         self._evaluator = Evaluator(curriculum, seed, self.log)
 
     def _opened(self, run_dir: Path, overwrite: bool, resume: bool) -> RunLog:
@@ -181,7 +190,6 @@ class Recorder:
             self._evaluated = state["evaluated"]
             self._trained = state["trained"]
             return resumed_log(run_dir, state, self._about, self._checkpoints.strict)
-        made_folder(run_dir)
         self._checkpoints.clear()
         if overwrite or stopped:
             remove_results(run_dir)
@@ -331,17 +339,26 @@ class Recorder:
 
     def close(self) -> None:
         """Write tables and metrics, close the log and the logger, and remove the checkpoints."""
-        self._end()
-        if self.run_dir is not None and not self.finished:
-            write_curriculum(self.curriculum, self.run_dir)
-            write_results(self.log, self.curriculum, self.run_dir)
-            self._checkpoints.clear()
+        try:
+            self._end()
+            if self.run_dir is not None and self._lock is not None:
+                write_curriculum(self.curriculum, self.run_dir)
+                write_results(self.log, self.curriculum, self.run_dir)
+                self._checkpoints.clear()
+        finally:
+            self._release()
 
     def _end(self) -> None:
         """Close the log and the logger."""
         self.log.close()
         if self._tracker is not None:
             self._tracker.close()
+
+    def _release(self) -> None:
+        """Let other writers into the directory."""
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
 
     def __getstate__(self) -> NamedValues:
         """Return what a copy has; two recorders cannot write into one directory."""
@@ -355,8 +372,11 @@ class Recorder:
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if error is None:
             self.close()
-        else:
+            return
+        try:
             self._end()
+        finally:
+            self._release()
 
     def _adapted(self, policy: Any, policy_for: Callable[[int], Any] | None, frames: int) -> Policy:
         ids = self.curriculum.task_ids

@@ -37,7 +37,7 @@ from ctgraph_rl.learn.refusals import check_adaptation, check_ids, check_rows
 from ctgraph_rl.learn.stacked import learn_together
 from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.escape import terminal_text
-from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG, METRICS
+from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG, METRICS, locked
 from ctgraph_rl.log.provenance import NUMBERS_TOGETHER, code_changes, learners, machine, provenance
 from ctgraph_rl.log.run_log import RunLog, metrics_text, write_metrics, write_performance
 from ctgraph_rl.log.scores import scores
@@ -150,6 +150,7 @@ def train(
     Raises:
         ValueError: before any work, for arguments out of range and an agent that cannot learn the curriculum; and if
             the directory holds a run that cannot be resumed.
+        BlockingIOError: if another writer is in the directory.
     """
     run_dir = as_path("run_dir", run_dir)
     count = len(curriculum.tasks) if isinstance(curriculum, Curriculum) else 0
@@ -169,28 +170,11 @@ def train(
         (can_listen, f"listeners must be a list of functions, such as [print], got {listeners!r:.80}"),
         (is_console, f"console must be a rich.console.Console, or None, got {console!r:.80}"),
     )
-    device = checked_device(device)
-    config = {"seed": seed, **(config or {})}
-    check_rows(curriculum, agent.num_envs)
-    check_ids(curriculum, agent)
     checkpoints = Checkpoints(run_dir / CHECKPOINTS) if checkpoints is None else checkpoints
-    checkpoints.tidy()
-    saved = checkpoints.newest()
-    if saved is not None and "failed" in saved:  # in a group that was stopped before it said so
-        checkpoints.clear()
-        raise FloatingPointError(saved["failed"])
+    config = {"seed": seed, **(config or {})}
     where = RunDirectory(run_dir, config, checkpoints, experts=experts, listeners=listeners, console=console)
-    done = 0 if saved is None else saved["frames"]
-    progress = ProgressBar(len(curriculum.blocks), curriculum.num_frames, console, done)
-
-    def learn(logs: Sequence[RunLog]) -> Failures:
-        [log] = logs
-        learn_curriculum(
-            curriculum, agent, seed, log, progress, device=device, saved=saved, checkpoint=checkpoints.offer
-        )
-        return {}
-
-    execute([Participant(curriculum, agent, where)], [saved], learn, progress)
+    with locked(run_dir):
+        train_alone(curriculum, agent, where, seed, checked_device(device))
 
 
 @dataclass(frozen=True)
@@ -237,6 +221,34 @@ class RunDirectory:
         experts = None if self.experts is None else [expert.log for expert in self.experts]
         write_results(log, curriculum, self.run_dir, experts)
         self.checkpoints.clear()
+
+
+def train_alone(curriculum: Curriculum, agent: Agent, where: RunDirectory, seed: int, device: torch.device) -> None:
+    """Let a new agent learn a curriculum into a directory that is locked; see `train`.
+
+    Raises:
+        ValueError: before any work, for an agent that cannot learn the curriculum, and a run that cannot be resumed.
+        FloatingPointError: if it failed in a group that was stopped before it said so.
+    """
+    check_rows(curriculum, agent.num_envs)
+    check_ids(curriculum, agent)
+    checkpoints = where.checkpoints
+    checkpoints.tidy()
+    saved = checkpoints.newest()
+    if saved is not None and "failed" in saved:
+        checkpoints.clear()
+        raise FloatingPointError(saved["failed"])
+    done = 0 if saved is None else saved["frames"]
+    progress = ProgressBar(len(curriculum.blocks), curriculum.num_frames, where.console, done)
+
+    def learn(logs: Sequence[RunLog]) -> Failures:
+        [log] = logs
+        learn_curriculum(
+            curriculum, agent, seed, log, progress, device=device, saved=saved, checkpoint=checkpoints.offer
+        )
+        return {}
+
+    execute([Participant(curriculum, agent, where)], [saved], learn, progress)
 
 
 def train_together(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import sys
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from ctgraph_rl.board.method_yaml import fact_rules, read_method
 from ctgraph_rl.board.submission import log_sum, read_submission
 from ctgraph_rl.board.submission_rules import oracle_rule
 from ctgraph_rl.board.submit import submit
+from ctgraph_rl.log.files import locked_new
 from ctgraph_rl.log.saved import sum_of_state
 from ctgraph_rl.runs.config import plain
 
@@ -271,6 +273,8 @@ def test_what_fails_while_it_is_written_leaves_nothing_and_what_is_there_is_neve
     with pytest.raises(FileExistsError, match="made exists: choose another folder, nothing is overwritten"):
         submit([runs], made, method, tiny_track)
     made.rmdir()
+    with locked_new(made), pytest.raises(BlockingIOError, match=f"made is in use by process {os.getpid()} on"):
+        submit([runs], made, method, tiny_track)
 
     def full(logs: object) -> bytes:
         raise OSError(28, "No space left on device")

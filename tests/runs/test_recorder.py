@@ -100,6 +100,7 @@ def test_frames_must_grow_and_a_log_is_not_overwritten(tmp_path):
 
     with pytest.raises(ValueError, match="frames must grow: 12 comes after 12"):
         recorder.evaluate(table(1), 12)
+    recorder.close()
     with pytest.raises(FileExistsError):
         Recorder(TASKS, tmp_path)
 
@@ -177,7 +178,7 @@ def test_a_directory_with_a_run_is_resumed_or_replaced_only_as_it_is_said(tmp_pa
 def test_overwrite_replaces_a_finished_run(tmp_path):
     for _ in range(2):
         with Recorder(TASKS, tmp_path, overwrite=True) as recorder:
-            assert [recorder.saved, *(path.name for path in tmp_path.iterdir())] == [None, "run.jsonl"]
+            assert [recorder.saved, {path.name for path in tmp_path.iterdir()}] == [None, {".lock", "run.jsonl"}]
             Learner().learn(recorder)
 
     with pytest.raises(FileExistsError, match=r"is of a finished run: .*, or overwrite=True .*, or resume=True"):
