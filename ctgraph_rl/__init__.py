@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from ctgraph_rl.core.rewards import ReferenceLinear as ReferenceLinear
     from ctgraph_rl.env import CTGraphEnv as CTGraphEnv
     from ctgraph_rl.learn.evaluate import evaluate as evaluate
+    from ctgraph_rl.learn.exact import exact_success as exact_success
+    from ctgraph_rl.learn.exact import exact_value as exact_value
     from ctgraph_rl.learn.lifelong import learn_curriculum as learn_curriculum
     from ctgraph_rl.log.run_log import RunLog as RunLog
     from ctgraph_rl.log.scores import scores as scores
@@ -55,6 +57,7 @@ _EXPORTS = {
     "core.rewards": ("Gradient", "Needle", "ReferenceLinear"),
     "env": ("CTGraphEnv",),
     "learn.evaluate": ("evaluate",),
+    "learn.exact": ("exact_success", "exact_value"),
     "learn.lifelong": ("learn_curriculum",),
     "log.run_log": ("RunLog",),
     "log.scores": ("scores",),

@@ -34,6 +34,10 @@ class Agent(Protocol):
 
     A recurrent policy reads its state under its own keys and writes the new one under ``("next", key)``. Where
     ``is_init`` is set, the state that it reads is that of `initial_state`.
+
+    For ``evaluation.exact=true`` it has ``action_probs(data)``, which returns the probabilities of all actions, float
+    [n, A], as the exploration type says, and its next state, by ``("next", key)``, as far as the action does not
+    decide it. It draws nothing, and what it returns for a row depends on that row alone.
     """
 
     def policy_for(self, task: int) -> TensorDictModuleBase:

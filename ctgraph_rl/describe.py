@@ -195,6 +195,8 @@ def evaluation_in_words(evaluation: Evaluation) -> str:
     which = {"all": "all tasks", "seen": "the tasks seen so far"}[evaluation.tasks]
     adapts = f", after {evaluation.adapt_episodes} to adapt" if evaluation.adapt_episodes else ""
     episodes = f"{evaluation.num_episodes} {how} episodes{in_row}{adapts}"
+    if evaluation.exact:
+        episodes = f"The exact means of {how} episodes"
     return f"{episodes} on each of {which}{held_out}: {', '.join(moments)}."
 
 

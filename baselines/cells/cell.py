@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from ctgraph_rl.checks import TakesNumbers, require, true_or_false
 from ctgraph_rl.core.dynamics import beside
 from ctgraph_rl.core.kernel import is_traced
+from ctgraph_rl.learn.collect import PREVIOUS_ACTION
 
 CellState = tuple[Tensor, ...]
 """The parts of a cell's state, [rows, ...] each, in the order of its ``state_keys``."""
@@ -22,9 +23,8 @@ Branches = Sequence[tuple[Tensor, Tensor]]
 """Of the histories of each length: which of the one shorter each continues, or which state, and the group of its last
 input; int64 [num_histories] each."""
 
-PREVIOUS_ACTION = "previous_action"
 REWARD = "reward"
-"""The keys of an agent's last action and reward."""
+"""The key of an agent's last reward."""
 
 
 class Cell(TakesNumbers, nn.Module):

@@ -15,10 +15,10 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import ProbabilisticActor, ValueOperator, recurrent_mode
 
-from baselines.cells.cell import PREVIOUS_ACTION, REWARD, Cell, CellState, MakeCell, can_branch, linear_layer, reset
+from baselines.cells.cell import REWARD, Cell, CellState, MakeCell, can_branch, linear_layer, reset
 from baselines.parts.distinct import distinct, histories, renumbered
 from ctgraph_rl.checks import one_of, require, require_memory
-from ctgraph_rl.learn.collect import UNSTORED
+from ctgraph_rl.learn.collect import PREVIOUS_ACTION, UNSTORED
 from ctgraph_rl.learn.guide import GUIDED_ACTION
 
 Data = Mapping[Any, Tensor]
@@ -375,6 +375,13 @@ class ActorCritic(TensorDictSequential):
             tensordict.set(key, value)
         return tensordict
 
+    def action_probs(self, data: Data) -> tuple[Tensor, Items]:
+        """Return the probabilities of actions, and the trunk's next state; see `ctgraph_rl.agent.Agent`."""
+        trunk, key, logits, *_ = self._parts
+        written = trunk.act(data)
+        chances = _normalised(logits(written.pop(key))).softmax(dim=-1)
+        return most_likely(chances) if is_greedy() else chances, written
+
     def act_on_tensors(self, data: Data) -> Items:
         """Return what `forward` writes; see `ctgraph_rl.learn.collect.act`."""
         trunk, key, logits, value, others = self._parts
@@ -402,6 +409,11 @@ def guided(data: Data, action: Tensor) -> Tensor:
 def is_greedy() -> bool:
     """Return whether policies take their best action at present, as TorchRL's exploration type says."""
     return exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE)
+
+
+def most_likely(values: Tensor) -> Tensor:
+    """Return probabilities of 1 for the largest of values, [..., n]."""
+    return one_hot(values.argmax(dim=-1), values.shape[-1]).to(values.dtype)
 
 
 def draw(chances: Tensor) -> Tensor:

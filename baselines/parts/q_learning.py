@@ -19,7 +19,7 @@ from torchrl.objectives import HardUpdate
 from torchrl.objectives.common import LossModule
 
 from baselines.parts.learner import MOST_PASSES, Learner
-from baselines.parts.networks import Data, Items, TensorsByName, guided
+from baselines.parts.networks import Data, Items, TensorsByName, guided, is_greedy, most_likely
 from baselines.parts.prioritized import PrioritySampler
 from baselines.update.update import make_optimiser
 from ctgraph_rl.checks import NamedValues, at_least_one, at_most, fraction, one_of, positive, require, require_memory
@@ -77,11 +77,9 @@ class EpsilonGreedy(TensorDictSequential):
 
     def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
         """Write ``action`` and the trunk's next state."""
-        greedy, exploration, *others = self.module
-        trunk, head = greedy.module[0].module
-        written = trunk.act(tensordict)
-        values = head.module(written.pop(head.in_keys[0]))
-        written["action"] = (values[0] if isinstance(values, tuple) else values).argmax(dim=-1)
+        exploration, *others = self.module[1:]
+        values, written = self._act(tensordict)
+        written["action"] = values.argmax(dim=-1)
         for key, value in written.items():
             tensordict.set(key, value)
         exploration(tensordict)
@@ -89,6 +87,22 @@ class EpsilonGreedy(TensorDictSequential):
         for module in others:
             module(tensordict)
         return tensordict
+
+    def action_probs(self, data: Data) -> tuple[Tensor, Items]:
+        """Return the probabilities of actions, and the trunk's next state; see `ctgraph_rl.agent.Agent`."""
+        values, written = self._act(data)
+        greedy = most_likely(values)
+        if is_greedy():
+            return greedy, written
+        eps = self.module[1].eps
+        return (1 - eps) * greedy + eps / values.shape[-1], written
+
+    def _act(self, data: Data) -> tuple[Tensor, Items]:
+        """Return the action values, [num_envs, num_actions], and the trunk's next state."""
+        trunk, head = self.module[0].module[0].module
+        written = trunk.act(data)
+        values = head.module(written.pop(head.in_keys[0]))
+        return values[0] if isinstance(values, tuple) else values, written
 
 
 class WithTarget(LossModule):

@@ -14,7 +14,6 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from baselines.cells.cell import PREVIOUS_ACTION
 from baselines.methods.method import Method
 from baselines.parts.learner import finite_means, table_of
 from baselines.parts.networks import Data, Items, TensorsByName, sequences_of
@@ -25,6 +24,7 @@ from baselines.update.update import update
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.core import philox
 from ctgraph_rl.core.region import Region
+from ctgraph_rl.learn.collect import PREVIOUS_ACTION
 from ctgraph_rl.learn.loop import Learnt
 
 AS_EVER = ("learn", "gradient_step", "minibatches", "after_update", "after_batch", "one_step", "reward", "advantages")

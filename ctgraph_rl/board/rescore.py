@@ -180,7 +180,7 @@ def of_the_protocol(submission: Submission, run: SubmittedRun, log: RunLog) -> I
     wanted = []
     for at in curriculum.moments:
         for number, _ in tasks_at(at).values():
-            wanted.append((at, number, how.num_episodes))
+            wanted.append((at, number, None if how.exact else how.num_episodes))
     there = [(m["frames"], m["task"], m.get("episodes")) for m in log.of_kind("evaluation")]
     notes = []
     for what, some in (("missing", {*wanted} - {*there}), ("more", {*there} - {*wanted})):

@@ -14,7 +14,7 @@ from torch import nn
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.learn.collect import Policy
-from ctgraph_rl.learn.evaluate import as_policy, positional
+from ctgraph_rl.learn.logits_policy import as_policy, positional
 
 
 def adapt(policy: Any, greedy: bool, num_actions: int | None, shows_ids: bool = False) -> Policy:

@@ -34,6 +34,9 @@ SHOWN = ("observation", "is_init", "step_count", "episode_reward")
 TRIAL = "trial"
 """A recurrent state with this key lasts over episodes: the policy resets it itself, where a trial begins."""
 
+PREVIOUS_ACTION = "previous_action"
+"""The key under which a recurrent state has the last action, int64 [rows]."""
+
 UNSTORED = "unstored_"
 """A recurrent state under a key with this beginning is carried from step to step, and a batch does not hold it for each
 of them: all steps of the batch show its value before the first one, and, after each step, that after the last one."""

@@ -4,26 +4,24 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
-from inspect import Parameter, signature
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
+from torch import nn
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import NamedValues, require, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL
 from ctgraph_rl.env import CTGraphEnv
-from ctgraph_rl.learn.collect import InitialState, Policy, act, make_env, start_of_episodes
+from ctgraph_rl.learn.collect import InitialState, Policy, act, agent_specs, make_env, start_of_episodes
+from ctgraph_rl.learn.exact import exact_measures, shown_id
 from ctgraph_rl.learn.labels import policies_by_label
+from ctgraph_rl.learn.logits_policy import as_policy
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.metrics.adaptation import exact_search
 from ctgraph_rl.policies import RandomPolicy
@@ -133,96 +131,6 @@ def _first_episodes(env: EnvBase, policy: Policy, initial_state: InitialState | 
     return result
 
 
-class LogitsPolicy:
-    """A plain module that maps observations to logits, as a policy: greedy, or sampling where exploration is on.
-
-    The module is given observations with the values that the environment shows, 0 to 255 for images, in the type and on
-    the device of its first parameter: it scales and flattens them itself. It acts in evaluation mode, without dropout,
-    and is left in the mode that it had. Where the protocol shows task ids and its ``forward`` needs two arguments, or
-    names the second one ``task_id``, the one-hot task ids are the second.
-
-    Args:
-        module: maps float [n, 1, r, r] or [n, K] to float [n, num_actions].
-        num_actions: logits of a row.
-    """
-
-    def __init__(self, module: nn.Module, num_actions: int) -> None:
-        self.module = module
-        self.num_actions = num_actions
-        self._takes_ids = _takes_ids(module.forward)
-
-    def __call__(self, data: TensorDictBase) -> TensorDictBase:
-        """Write ``action``, int64 [n]."""
-        logits = self._logits(data)
-        greedy = exploration_type() == ExplorationType.DETERMINISTIC
-        action = logits.argmax(-1) if greedy else torch.distributions.Categorical(logits=logits).sample()
-        return data.set("action", action.to(data.device or "cpu"))
-
-    def _logits(self, data: TensorDictBase) -> Tensor:
-        """Return the logits of all rows.
-
-        Raises:
-            ValueError: if the module fails or gives anything else; says what to write.
-        """
-        name = type(self.module).__name__
-        shape = list(data["observation"].shape)
-        wanted = (
-            f"a plain module must map observations, float {shape}, to logits, float [{shape[0]}, {self.num_actions}]"
-        )
-        fix = "write one that does, or a function of a TensorDict that sets 'action', or a TensorDictModule"
-        like = next(self.module.parameters(), torch.zeros((), dtype=torch.float32, device="cpu"))
-        keys = ["observation", "task_id"] if self._takes_ids and "task_id" in data.keys() else ["observation"]  # noqa: SIM118
-        try:
-            with _evaluation_mode(self.module):
-                logits = self.module(*(data[key].to(like.device, like.dtype) for key in keys))
-        except (RuntimeError, TypeError, IndexError, KeyError, AttributeError) as error:
-            raise ValueError(
-                f"{wanted}; {name} fails with {type(error).__name__}: {str(error)[:200]}. Fix: {fix}"
-            ) from error
-        is_tensor = isinstance(logits, Tensor)
-        fits = is_tensor and logits.is_floating_point() and list(logits.shape) == [shape[0], self.num_actions]
-        got = f"{str(logits.dtype).removeprefix('torch.')} {list(logits.shape)}" if is_tensor else type(logits).__name__
-        require((fits, f"{wanted}; {name} gives {got}. Fix: {fix}"))
-        require((not logits.isnan().any(), f"{name} gives logits that are nan: its weights left the range of floats"))
-        return logits
-
-
-def _takes_ids(function: Any) -> bool:
-    """Return whether a function needs two positional arguments, or its second one is named ``task_id``."""
-    try:
-        places = positional(function)
-    except ValueError:  # of a traced module, which has none
-        return False
-    return sum(p.default is p.empty for p in places) == 2 or [p.name for p in places[1:2]] == ["task_id"]
-
-
-def positional(function: Any) -> list[Parameter]:
-    """Return the positional parameters of a function."""
-    kinds = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
-    return [parameter for parameter in signature(function).parameters.values() if parameter.kind in kinds]
-
-
-@contextmanager
-def _evaluation_mode(module: nn.Module) -> Iterator[None]:
-    """Let a module compute without dropout and without a change of its running means; its mode is restored."""
-    training = [each for each in module.modules() if each.training]
-    module.eval()
-    try:
-        yield
-    finally:
-        for each in training:
-            each.training = True
-
-
-def as_policy(policy: Policy | nn.Module, num_actions: int | None) -> Policy:
-    """Return a plain module as a policy of TensorDicts; what is one already unchanged."""
-    plain = isinstance(policy, nn.Module) and not isinstance(policy, TensorDictModuleBase)
-    if not plain:
-        return policy
-    require((num_actions is not None, "a plain module gives logits, and actions are continuous: give a function"))
-    return LogitsPolicy(policy, num_actions)  # type: ignore[arg-type]
-
-
 EPISODE_KEYS = ("episode_reward", "outcome", "step_count")
 """What `episode_means` reads."""
 
@@ -291,10 +199,16 @@ class Evaluator:
     def evaluate_if_due(self, agent: Agent, frames: int) -> None:
         """Evaluate an agent where the curriculum evaluates after ``frames`` frames of the run."""
         moment = self.curriculum.moment(frames)
-        if moment is not None:
-            policy = self._policy(agent, self.tasks_at(frames), frames)
-            acts = policy.__call__ if isinstance(policy, nn.Module) else policy  # reads TensorDicts whatever it is
-            self.evaluate(acts, frames, moment, agent.initial_state)
+        if moment is None:
+            return
+        tasks = self.tasks_at(frames)
+        policies = self._policies(agent, tasks, frames)
+        if self.curriculum.evaluation.exact:
+            self._measure(policies, frames, moment, agent.initial_state)
+            return
+        policy = _of_each(agent, policies)
+        acts = policy.__call__ if isinstance(policy, nn.Module) else policy  # reads TensorDicts whatever it is
+        self.evaluate(acts, frames, moment, agent.initial_state)
 
     def evaluate(self, policy: Policy, frames: int, moment: str, initial_state: InitialState | None = None) -> None:
         """Evaluate a policy after ``frames`` frames and append one line for each task."""
@@ -303,6 +217,9 @@ class Evaluator:
         if not tasks:
             return
         how = curriculum.evaluation
+        if how.exact:
+            self._measure([policy] * len(tasks), frames, moment, initial_state)
+            return
         num_rows = how.num_episodes // how.episodes_per_row
         result = evaluate(
             policy,
@@ -315,20 +232,43 @@ class Evaluator:
             device=self.device,
             curriculum=curriculum,
         )
-        for (task, (number, label)), episodes in zip(tasks.items(), result, strict=True):
-            append = partial(
-                self.log.append,
-                moment=moment,
-                block=curriculum.block_at(frames),
-                frames=frames,
-                task=number,
-                label=label,
-                held_out=number > len(curriculum.tasks),
-            )
+        for (task, named), episodes in zip(tasks.items(), result, strict=True):
+            append = self._append(named, frames, moment)
             rows = episodes.view(num_rows, how.row_episodes)
             append("evaluation", **episode_means(rows[:, how.adapt_episodes :].reshape(-1)))
             for measured in adaptation(rows, task) if how.adapt_episodes else ():
                 append("adaptation", **measured)
+
+    def _measure(
+        self, policies: Sequence[Policy], frames: int, moment: str, initial_state: InitialState | None
+    ) -> None:
+        """Append one line for each task with the exact means of its policy."""
+        curriculum = self.curriculum
+        shape = agent_specs(curriculum).observation["observation"].shape
+        for (task, named), policy in zip(self.tasks_at(frames).items(), policies, strict=True):
+            measures = exact_measures(
+                policy,
+                task,
+                greedy=curriculum.evaluation.greedy,
+                initial_state=initial_state,
+                task_id=shown_id(curriculum, task),
+                shape=shape,
+            )
+            self._append(named, frames, moment)("evaluation", episodes=None, **vars(measures), exact=True)
+
+    def _append(self, named: tuple[int, str], frames: int, moment: str) -> Callable[..., None]:
+        """Return what appends a line on a task with a number and a label to the log."""
+        number, label = named
+        curriculum = self.curriculum
+        return partial(
+            self.log.append,
+            moment=moment,
+            block=curriculum.block_at(frames),
+            frames=frames,
+            task=number,
+            label=label,
+            held_out=number > len(curriculum.tasks),
+        )
 
     def tasks_at(self, frames: int) -> dict[TaskLike, tuple[int, str]]:
         """Return the tasks that are evaluated after ``frames`` frames, with their numbers and labels."""
@@ -340,14 +280,14 @@ class Evaluator:
         seen = {i + 1 for block in curriculum.trained[: curriculum.block_at(frames)] for i in block}
         return {task: name for task, name in named.items() if name[0] in seen or name[0] > len(curriculum.tasks)}
 
-    def _policy(self, agent: Agent, tasks: Iterable[TaskLike], frames: int) -> Policy:
-        """Return the agent's policy; where task ids are given, or the agent has labels, the one for each task."""
+    def _policies(self, agent: Agent, tasks: Collection[TaskLike], frames: int) -> Sequence[Policy]:
+        """Return the agent's policy for each task: where ids are given, or the agent has labels, they may differ."""
         if hasattr(agent, "policy_for_label"):
-            return _of_each(agent, policies_by_label(agent, self.curriculum, self.log, tasks, frames))
+            return policies_by_label(agent, self.curriculum, self.log, tasks, frames)
         if self.curriculum.protocol.task_id == "hidden":
-            return agent.policy
+            return [agent.policy] * len(tasks)
         ids = self.curriculum.task_ids
-        return _of_each(agent, [agent.policy_for(ids[task]) if task in ids else agent.policy for task in tasks])
+        return [agent.policy_for(ids[task]) if task in ids else agent.policy for task in tasks]
 
 
 def _of_each(agent: Agent, policies: Sequence[Policy]) -> Policy:

@@ -20,7 +20,7 @@ from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues
 from ctgraph_rl.learn.collect import Policy, make_env
 from ctgraph_rl.learn.evaluate import Evaluator
-from ctgraph_rl.learn.refusals import check_adaptation, check_env, check_ids, check_rows, resumes
+from ctgraph_rl.learn.refusals import check_adaptation, check_env, check_exact, check_ids, check_rows, resumes
 from ctgraph_rl.learn.segments import Segment, announced_id, collect_segment, guided, log_training, segments
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -183,6 +183,7 @@ class Lockstep:
         check_rows(curriculum, group.agents[0].num_envs)
         check_ids(curriculum, group.agents[0])
         check_adaptation(curriculum, group.agents[0])
+        check_exact(curriculum, group.agents[0])
         self.curriculum = curriculum
         self.group = group
         self.seeds = seeds

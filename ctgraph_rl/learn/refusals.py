@@ -12,6 +12,7 @@ from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import Rule, require
 from ctgraph_rl.core.rewards import KERNEL_REWARDS
 from ctgraph_rl.env import CTGraphEnv
+from ctgraph_rl.learn.exact import exact_rules
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Block
 from ctgraph_rl.tasks.task import Task
@@ -62,6 +63,23 @@ def check_ids(curriculum: Curriculum, agent: Agent) -> None:
     shows = curriculum.protocol.task_id == "one_hot"
     message = f"{type(agent).__name__} reads task ids, which {curriculum.name} does not show"
     require((shows or not reads, f"{message}; give it a curriculum with protocol.task_id=one_hot, or make a new agent"))
+
+
+def check_exact(curriculum: Curriculum, agent: Agent) -> None:
+    """Refuse exact evaluation of an agent, or on a task, that has no exact measures.
+
+    Raises:
+        ValueError: names the reason and the setting to use.
+    """
+    if not curriculum.evaluation.exact:
+        return
+    start = dict(agent.initial_state(1).items())
+    rules: dict[str, Rule] = {}
+    for task in (*curriculum.tasks, *curriculum.evaluation.held_out):
+        for holds, message in exact_rules(agent.policy, task, start):
+            if not holds:
+                rules[message] = (holds, message)
+    require(*rules.values())
 
 
 def check_adaptation(curriculum: Curriculum, agent: Agent) -> None:

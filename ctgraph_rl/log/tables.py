@@ -30,7 +30,7 @@ RUN = {
     "seed": ("int64", "seed of the run"),
 }
 EPISODES = {
-    "episodes": ("int64", "finished episodes"),
+    "episodes": ("int64", "finished episodes; empty where means are exact"),
     "return_mean": ("double", "their mean return"),
     "success_rate": ("double", "share that reached the goal"),
     "end_rate": ("double", "share that reached an end state"),

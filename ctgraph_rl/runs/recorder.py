@@ -49,7 +49,7 @@ class Recorder:
     - a function ``(observation, state, episode_start)`` that returns ``(actions, state)``, for memory: the first state
       is None, and ``episode_start``, bool [n], says which rows start an episode;
     - an object with ``predict``, such as a model of Stable-Baselines3, greedy where the protocol is;
-    - a plain ``torch.nn.Module`` that maps observations to logits, see `ctgraph_rl.learn.evaluate.LogitsPolicy`;
+    - a plain ``torch.nn.Module`` that maps observations to logits, see `ctgraph_rl.learn.logits_policy.LogitsPolicy`;
     - a TensorDict module without recurrent state, or a class of `ctgraph_rl.policies`.
 
     Observations are NumPy arrays. Where the protocol shows task ids with observations, any other function and

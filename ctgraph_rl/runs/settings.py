@@ -36,7 +36,12 @@ _CELL: NamedValues = {"cell": LSTM, **_ENCODER}
 _BACKBONE: NamedValues = {"backbone_seed": None}
 
 ADDED: dict[str, NamedValues] = {
-    "run": {"portable": False, "protocol.guide_frames": None, "evaluation.adapt_episodes": None},
+    "run": {
+        "portable": False,
+        "protocol.guide_frames": None,
+        "evaluation.adapt_episodes": None,
+        "evaluation.exact": None,
+    },
     "baselines.dqn.DQN": _ENCODER,
     "baselines.mohqa.MOHQA": _ENCODER,
     "baselines.a2c.A2C": _DEDUPLICATE,

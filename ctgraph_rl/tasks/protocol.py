@@ -109,6 +109,8 @@ class Evaluation:
         held_out: further tasks that are evaluated each time and never trained.
         adapt_episodes: episodes that a row plays before its ``episodes_per_row``, in which the agent may adapt to the
             row's task. Means are over the episodes after them; the log also has the means of each episode of a row.
+        exact: compute the means of all episodes that could be played, and play none; ``num_episodes`` and
+            ``episodes_per_row`` have no effect. See `ctgraph_rl.learn.exact` for what has exact means.
 
     Raises:
         ValueError: for values out of range.
@@ -123,6 +125,7 @@ class Evaluation:
     tasks: str = "all"
     held_out: tuple[TaskLike, ...] = ()
     adapt_episodes: int = field(default=0, metadata={"added": True})
+    exact: bool = field(default=False, metadata={"added": True})
 
     def __post_init__(self) -> None:
         make_fields_plain(self)
@@ -132,7 +135,7 @@ class Evaluation:
         object.__setattr__(self, "held_out", held_out)
         require(
             *at_least_one(num_episodes=n, episodes_per_row=per_row),
-            *true_or_false(greedy=self.greedy, before=self.before, at_block_ends=self.at_block_ends),
+            *true_or_false(greedy=self.greedy, before=self.before, at_block_ends=self.at_block_ends, exact=self.exact),
             (is_int(self.every, 0), f"every must be an integer >= 0, got {self.every!r}"),
             (is_int(self.adapt_episodes, 0), f"adapt_episodes must be an integer >= 0, got {self.adapt_episodes!r}"),
             *one_of(EVALUATED, tasks=self.tasks),
@@ -141,6 +144,10 @@ class Evaluation:
         require(
             (n % per_row == 0, f"num_episodes={n} must be a multiple of episodes_per_row={per_row}"),
             (len(set(self.held_out)) == len(self.held_out), "held_out tasks must differ"),
+            (
+                not (self.exact and self.adapt_episodes),
+                f"exact must be false with adapt_episodes={self.adapt_episodes}",
+            ),
         )
 
     @property

@@ -84,15 +84,41 @@ def policy_value(task: Task, policy: Tensor, gamma: float = 1.0) -> float:
             `MAX_ENUMERATED_STATES` states where every state has to be visited.
     """
     require(*fraction(gamma=gamma), *_policy_rules(task, policy))
-    shared = not (task.observations.unique_waits or task.observations.unique_decisions)
-    chooser = _Memoryless(task, gamma, policy.detach().to("cpu", torch.float64))
-    return _value_at_home(smallest_tree(task, is_needle(task) and shared), chooser)
+    return _value_of_table(task, policy.detach().to("cpu", torch.float64), gamma)
 
 
 def success_prob(task: Task, policy: Tensor) -> float:
     """The probability that a memoryless policy reaches the goal, whatever the rewards; arguments as `policy_value`."""
     paid = replace(task, reward_fn=Needle(), goal_reward=1.0, fail_reward=0.0, step_reward=0.0)
     return policy_value(paid, policy)
+
+
+@dataclass
+class Measures:
+    """Exact means over the episodes of a policy."""
+
+    return_mean: float
+    success_rate: float
+    end_rate: float
+    length_mean: float
+
+
+def policy_measures(task: Task, policy: Tensor, gamma: float = 1.0) -> Measures:
+    """The expected return, success rate, end rate and length of a memoryless policy; arguments as `policy_value`.
+
+    They are values of other rewards: 1 at the goal; 1 for an action that fails; 1 for each step.
+    """
+    require(*fraction(gamma=gamma), *_policy_rules(task, policy))
+    probs = policy.detach().to("cpu", torch.float64)
+    needle = replace(task, reward_fn=Needle(), goal_reward=1.0, fail_reward=0.0, step_reward=0.0)
+    success = _value_of_table(needle, probs, 1.0)
+    ends = 1 + _value_of_table(replace(needle, fail_reward=-1.0), probs, 1.0) - success
+    return Measures(
+        return_mean=success if task == needle and gamma == 1 else _value_of_table(task, probs, gamma),
+        success_rate=success,
+        end_rate=max(ends, success),  # but for rounding it is
+        length_mean=_value_of_table(replace(needle, step_reward=1.0), probs, 1.0) - success,
+    )
 
 
 def memoryless_ceiling(task: Task, deterministic: bool = False) -> float:
@@ -222,6 +248,12 @@ def _random_episode_length(task: Task) -> Fraction:
     leaves = (1 - p) / (b + 1 - p)
     reached = [(leaves * b / (b + 1)) ** k for k in range(d + 1)]
     return 1 + wait * sum(reached) + leaves * (sum(reached[:d]) + task.extra_end_step * reached[d])
+
+
+def _value_of_table(task: Task, policy: Tensor, gamma: float) -> float:
+    """The value of a memoryless policy, float64 [num_images, A]."""
+    shared = not (task.observations.unique_waits or task.observations.unique_decisions)
+    return _value_at_home(smallest_tree(task, is_needle(task) and shared), _Memoryless(task, gamma, policy))
 
 
 def _value_at_home(tree: _EveryNode | _GoalPath, chooser: BestActions | _Memoryless) -> float:

@@ -1,0 +1,420 @@
+"""Evaluation without episodes: the exact mean return, success rate, end rate and length of a policy on a CT-graph.
+
+Without noise on reading, an agent can have seen only finitely many things. A policy without memory is a table with a
+row for each image, whose values follow by backward induction (`ctgraph_rl.tasks.values`). With memory, all histories
+that do not end are played at once, each weighted by its probability: an action that fails ends an episode, so only
+waits at wait states, decisions at decision states, and drawn images branch.
+
+Where waits are drawn (p > 0), an episode may stay in a wait state for ever. Stays of a probability below `LEAST_STAY`
+are left out, which changes a success rate by less than (d + 1) times that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import one_hot
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from ctgraph_rl.checks import Rule, fraction, require
+from ctgraph_rl.core.graph import WAIT_ACTION, StateType
+from ctgraph_rl.core.rewards import Arrival
+from ctgraph_rl.learn.collect import PREVIOUS_ACTION, TRIAL, InitialState, Policy, Step
+from ctgraph_rl.learn.logits_policy import as_policy
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.kinds.task_like import TaskLike
+from ctgraph_rl.tasks.memory import bank_key, make_bank
+from ctgraph_rl.tasks.task import Task, are_graphs
+from ctgraph_rl.tasks.values import Measures, policy_measures
+
+LEAST_STAY = 1e-12
+"""Probability of a stay in a wait state below which it is left out."""
+
+MOST_HISTORIES = 2**22
+"""Largest number of histories that are played; 10 s of an LSTM on one core."""
+
+HISTORIES_AT_ONCE = 2**15
+"""Histories of one forward pass; more are played in turn."""
+
+ActionProbs = Callable[[Tensor], Tensor]
+"""Maps images, uint8 [n, *shape], to action probabilities, float [n, A], or to actions, int64 [n]."""
+
+
+@torch.no_grad()
+def exact_measures(
+    policy: Policy,
+    task: Task,
+    *,
+    greedy: bool,
+    initial_state: InitialState | None = None,
+    task_id: Tensor | None = None,
+    shape: Sequence[int] | None = None,
+    gamma: float = 1.0,
+) -> Measures:
+    """Return the exact measures of a policy of TensorDicts on a task; torch's global generator is not used.
+
+    Args:
+        policy: has ``action_probs``, see `ctgraph_rl.agent.Agent`.
+        task: a CT-graph for which `exact_rules` hold.
+        greedy: of the most likely actions; False: of actions that are sampled and explore as in training.
+        initial_state: gives a recurrent policy's state for a number of rows; None or empty: it has no memory.
+        task_id: one-hot, uint8 [num_task_ids], where the protocol shows ids.
+        shape: of observations, where vectors are padded to a longer one; None: the task's own.
+        gamma: discount of the return, in [0, 1].
+
+    Raises:
+        ValueError: lists the reasons why there are no exact measures.
+    """
+    start = {} if initial_state is None else dict(initial_state(1).items())
+    require(*exact_rules(policy, task, start))
+    shown = _Shown(task, tuple(task.observation_shape if shape is None else shape), task_id)
+    exploration = ExplorationType.DETERMINISTIC if greedy else ExplorationType.RANDOM
+    with set_exploration_type(exploration):
+        if not start:
+            return policy_measures(task, _table(policy, task, shown), gamma)
+        return _Enumeration(policy, task, shown, gamma).measures(start)
+
+
+def exact_success(policy: ActionProbs | nn.Module, task: Task) -> float:
+    """Return the probability that a policy without memory reaches the goal, without playing an episode.
+
+    Args:
+        policy: maps images, uint8 [n, \\*shape], to action probabilities, float [n, A], or to actions, int64 [n],
+            which are taken as deterministic. A plain module maps them to logits, which are sampled.
+        task: a CT-graph without noise on reading.
+
+    Raises:
+        ValueError: for noise on reading, a goal that changes, probabilities of a wrong shape, and rows of them that do
+            not sum to 1.
+
+    Example:
+        >>> from ctgraph_rl.tasks.configurations import ct_su_b1
+        >>> uniform = lambda images: images.new_full((len(images), 3), 1 / 3, dtype=torch.float64)
+        >>> round(1 / exact_success(uniform, ct_su_b1()))  # P_R
+        243
+    """
+    return _of_function(policy, task, 1.0).success_rate
+
+
+def exact_value(policy: ActionProbs | nn.Module, task: Task, gamma: float = 1.0) -> float:
+    """Return the expected discounted return of a policy without memory; arguments as `exact_success`.
+
+    Args:
+        policy: as there.
+        task: as there.
+        gamma: discount, in [0, 1]; with 1 the mean return.
+    """
+    require(*fraction(gamma=gamma))
+    return _of_function(policy, task, gamma).return_mean
+
+
+def exact_rules(policy: Policy, task: TaskLike, start: Step) -> Iterator[Rule]:
+    """Yield the rules for exact measures: what of a policy and a task has none, and what to do.
+
+    Args:
+        policy: what plays.
+        task: what is played.
+        start: the recurrent state before an episode, of one row; empty without memory.
+    """
+    episodes = "set evaluation.exact=false, which plays episodes"
+    kind = type(task).__name__
+    yield isinstance(task, Task), f"exact evaluation needs CT-graphs, got {kind}: {episodes}"
+    if not isinstance(task, Task):
+        return
+    name = type(policy).__name__
+    has_probs = hasattr(policy, "action_probs")
+    yield has_probs, f"exact evaluation needs a policy with action_probs, which {name} has not: {episodes}"
+    lasts = f"exact evaluation needs episodes that do not depend on earlier ones, as those of {name} do: {episodes}"
+    yield TRIAL not in start, lasts
+    noise = task.observations.read_noise
+    yield noise == 0, f"exact evaluation needs images without noise, got read_noise={noise}: {episodes}"
+    change = task.goal_change
+    yield change is None, f"exact evaluation needs a goal that stays, got goal_change={change}: {episodes}"
+    if start and noise == 0:
+        reads_actions = PREVIOUS_ACTION in start
+        count = count_histories(task, reads_actions)
+        many = f"exact evaluation with memory plays all histories, here {count:.2g}, and at most {MOST_HISTORIES:,}"
+        yield count <= MOST_HISTORIES, f"{many}: {episodes}"
+
+
+def shown_id(curriculum: Curriculum, task: TaskLike) -> Tensor | None:
+    """Return the one-hot id of a task that observations show, uint8; zeros for a held-out one, None without ids."""
+    protocol = curriculum.protocol
+    if protocol.task_id != "one_hot":
+        return None
+    shown = torch.zeros(protocol.length(len(curriculum.tasks)), dtype=torch.uint8, device="cpu")
+    if task in curriculum.task_ids:
+        shown[curriculum.task_ids[task]] = 1
+    return shown
+
+
+def count_histories(task: Task, reads_actions: bool) -> float:
+    """Return how many histories an agent with memory can have of an episode that does not fail; stays are cut."""
+    graph = task.graph
+    x = task.observations
+    stays = _longest_stay(graph.wait_prob)
+    of_waits = 1 if x.is_unique(StateType.WAIT) else x.wait_ids[1] - x.wait_ids[0] + 1
+    of_decisions = 1 if x.is_unique(StateType.DECISION) else x.decision_ids[1] - x.decision_ids[0] + 1
+    views = _num_views(task)
+    waits = sum(math.pow(of_waits * views, length) for length in range(1, stays + 1)) if stays < 100 else math.inf
+    first = (x.home_ids[1] - x.home_ids[0] + 1) * views * (graph.branching_factor + 1 if reads_actions else 1)
+    level = waits * of_decisions * views * graph.branching_factor
+    return float(first) * math.pow(level, graph.depth) * waits
+
+
+def _longest_stay(wait_prob: float) -> int:
+    """Return the steps in a wait state after which staying on has a probability below `LEAST_STAY`."""
+    return 1 if wait_prob == 0 else 1 + math.ceil(math.log(LEAST_STAY) / math.log(wait_prob))
+
+
+def _num_views(task: Task) -> int:
+    """Return how many images each id has, rotated ones included."""
+    return task.images.num_variants * (task.observations.read_rotation + 1)
+
+
+def _of_function(policy: ActionProbs | nn.Module, task: Task, gamma: float) -> Measures:
+    """Return the exact measures of a function of images."""
+    require((are_graphs([task]), f"exact values are those of CT-graphs, got {type(task).__name__}"))
+    acts = as_policy(policy, task.num_actions) if isinstance(policy, nn.Module) else _Function(policy, task.num_actions)
+    return exact_measures(acts, task, greedy=False, gamma=gamma)
+
+
+@dataclass(frozen=True)
+class _Function:
+    """A function of images, as a policy with ``action_probs``."""
+
+    function: ActionProbs
+    num_actions: int
+
+    def action_probs(self, data: Step) -> tuple[Tensor, Step]:
+        """Return action probabilities, and no state."""
+        probs = self.function(data["observation"])
+        is_tensor = isinstance(probs, Tensor) and len(probs) == len(data["observation"])
+        acts = is_tensor and probs.dim() == 1 and not probs.is_floating_point()
+        chooses = is_tensor and probs.dim() == 2 and probs.is_floating_point()
+        got = f"{probs.dtype} {list(probs.shape)}" if isinstance(probs, Tensor) else type(probs).__name__
+        rule = f"policy must map {len(data['observation'])} images to float [n, A] or int64 [n], got {got}"
+        require((acts or chooses, rule))
+        return (one_hot(probs.long(), self.num_actions).double() if acts else probs), {}
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """What a policy reads of a task: images, padded where others are longer, and the task's id.
+
+    Args:
+        task: what is played.
+        shape: of observations.
+        task_id: one-hot, or None.
+    """
+
+    task: Task
+    shape: tuple[int, ...]
+    task_id: Tensor | None
+
+    @property
+    def bank(self) -> Tensor:
+        """All views, uint8 [num_images * views, *shape]."""
+        bank = make_bank(bank_key(self.task))
+        missing = self.shape[-1] - bank.shape[-1]
+        return nn.functional.pad(bank, (0, missing)) if missing else bank
+
+    def data(self, images: Tensor, is_init: bool) -> Step:
+        """Return the data of rows that see images, uint8 [n, *shape]."""
+        data: Step = {"observation": images, "is_init": torch.full([len(images), 1], is_init, device="cpu")}
+        if self.task_id is not None:
+            data["task_id"] = self.task_id.expand(len(images), -1)
+        return data
+
+
+def _table(policy: Any, task: Task, shown: _Shown) -> Tensor:
+    """Return the action probabilities of each id, float64 [num_images, A]; those of ids that decide nothing are equal.
+
+    Each observation draws a view of an id, so an id's probabilities are the mean over its views.
+    """
+    x = task.observations
+    ids = torch.cat([torch.arange(first, last + 1) for first, last in (x.wait_ids, x.decision_ids)])
+    views = _num_views(task)
+    rows = (ids.unsqueeze(1) * views + torch.arange(views)).flatten()
+    probs, _ = policy.action_probs(shown.data(shown.bank.index_select(0, rows), False))
+    table = torch.full([task.images.num_images, probs.shape[1]], 1 / probs.shape[1], dtype=torch.float64)
+    table[ids] = probs.double().view(len(ids), views, -1).mean(1)
+    return table
+
+
+@dataclass
+class _Histories:
+    """Histories that have not ended, all in the same kind of state: ``node``, int64 [n], and what was seen of them.
+
+    Args:
+        node: where they are.
+        weight: their probabilities, float64 [n].
+        discount: gamma to the power of their steps, float64 [n].
+        state: the recurrent state of each.
+    """
+
+    node: Tensor
+    weight: Tensor
+    discount: Tensor
+    state: Step
+
+    def select(self, rows: Tensor) -> _Histories:
+        """Return some of them; a row may be taken several times."""
+        state = {key: value.index_select(0, rows) for key, value in self.state.items()}
+        return _Histories(self.node[rows], self.weight[rows], self.discount[rows], state)
+
+
+class _Enumeration:
+    """All histories of a policy with memory, played depth first in parts of `HISTORIES_AT_ONCE`.
+
+    Args:
+        policy: has ``action_probs``.
+        task: what is played.
+        shown: what the policy reads of it.
+        gamma: discount of the return.
+    """
+
+    def __init__(self, policy: Any, task: Task, shown: _Shown, gamma: float) -> None:
+        self.policy = policy
+        self.task = task
+        self.shown = shown
+        self.gamma = gamma
+        self.bank = shown.bank
+        self.paid = self._paid()
+        self.stays = _longest_stay(task.graph.wait_prob)
+        self.sums = Measures(0.0, 0.0, 0.0, 0.0)
+
+    def measures(self, start: Step) -> Measures:
+        """Return the measures of all histories that begin with a recurrent state, of one row."""
+        ones = torch.ones(1, dtype=torch.float64)
+        self._at_home(_Histories(torch.zeros(1, dtype=torch.int64), ones, ones, start))
+        return self.sums
+
+    def _paid(self) -> Tensor:
+        """Return what end states pay, float64 [b^d]."""
+        graph = self.task.graph
+        leaf = torch.arange(graph.num_end_states)
+        sizes = (torch.full_like(leaf, graph.branching_factor), torch.full_like(leaf, graph.depth))
+        arrival = Arrival(leaf, torch.full_like(leaf, self.task.goal_leaf), *sizes, graph.depth)
+        return self.task.goal_reward * self.task.reward_fn(arrival).double()
+
+    def _at_home(self, histories: _Histories) -> None:
+        """Take the first step, with any action."""
+        seen, probs, written = self._act(histories, StateType.HOME, 0, is_init=True)
+        self._count_steps(seen)
+        for action in range(probs.shape[1]) if PREVIOUS_ACTION in seen.state else [-1]:
+            chance = probs[:, action] if action >= 0 else torch.ones_like(seen.weight)
+            self._at_wait(self._after(seen, written, chance, action), 0)
+
+    def _at_wait(self, histories: _Histories, level: int) -> None:
+        """Wait until that leads on; another action fails."""
+        for part in _parts(histories):
+            p = self.task.graph.wait_prob
+            staying = part
+            left = []
+            for stay in range(self.stays):
+                seen, probs, written = self._act(staying, StateType.WAIT, level)
+                self._count_steps(seen)
+                self._fail(seen, 1 - probs[:, WAIT_ACTION])
+                waits = probs[:, WAIT_ACTION]
+                left.append(self._after(seen, written, (1 - p) * waits, WAIT_ACTION))
+                if stay + 1 < self.stays:
+                    staying = self._after(seen, written, p * waits, WAIT_ACTION)
+            leads_on = _joined(left)
+            if level == self.task.graph.depth:
+                self._arrive(leads_on)
+            else:
+                self._at_decision(leads_on, level)
+
+    def _at_decision(self, histories: _Histories, level: int) -> None:
+        """Decide; another action fails."""
+        graph = self.task.graph
+        b = graph.branching_factor
+        for part in _parts(histories):
+            seen, probs, written = self._act(part, StateType.DECISION, level)
+            self._count_steps(seen)
+            self._fail(seen, 1 - probs[:, 1 : b + 1].sum(1))
+            for decision in range(1, b + 1):
+                after = self._after(seen, written, probs[:, decision], decision)
+                branch = torch.full_like(after.node, decision)
+                swap = self.task.swapped_branches
+                if swap is not None and decision in swap[1]:
+                    branch = torch.where(after.node == self.task.swapped_node, sum(swap[1]) - decision, branch)
+                after.node = after.node * b + branch
+                self._at_wait(after, level + 1)
+
+    def _act(
+        self, histories: _Histories, kind: StateType, level: int, is_init: bool = False
+    ) -> tuple[_Histories, Tensor, Step]:
+        """Return histories with each image that they may see, float64 [n, A] probabilities, and what was written."""
+        x = self.task.observations
+        first, last = x.ids(kind)
+        views = _num_views(self.task)
+        count = len(histories.node)
+        if x.is_unique(kind):
+            before = x.first_of_level(self.task.graph, kind, level)
+            ids = first + (before + histories.node - self.task.graph.first_node(level)) % (last - first + 1)
+            ids = ids.unsqueeze(1)
+        else:
+            ids = torch.arange(first, last + 1).expand(count, -1)
+        images = (ids.unsqueeze(2) * views + torch.arange(views)).flatten(1)
+        rows = torch.arange(count).repeat_interleave(images.shape[1])
+        seen = histories.select(rows)
+        seen.weight = seen.weight / images.shape[1]
+        data = self.shown.data(self.bank.index_select(0, images.flatten()), is_init)
+        probs, written = self.policy.action_probs({**data, **seen.state})
+        return seen, probs.double(), written
+
+    def _after(self, seen: _Histories, written: Step, chance: Tensor, action: int) -> _Histories:
+        """Return the histories that take an action, those that do so with probability 0 left out."""
+        state = {}
+        for key, value in seen.state.items():
+            state[key] = written.get(("next", key), value)
+        if PREVIOUS_ACTION in state:
+            state[PREVIOUS_ACTION] = torch.full_like(state[PREVIOUS_ACTION], action)
+        if "reward" in state:
+            state["reward"] = torch.full_like(state["reward"], self.task.step_reward)
+        weight = seen.weight * chance
+        taken = _Histories(seen.node, weight, seen.discount * self.gamma, state)
+        return taken.select((weight > 0).nonzero().squeeze(1))
+
+    def _count_steps(self, histories: _Histories) -> None:
+        """Count a step of all histories, and its reward."""
+        self.sums.length_mean += histories.weight.sum().item()
+        self.sums.return_mean += self.task.step_reward * (histories.weight * histories.discount).sum().item()
+
+    def _fail(self, seen: _Histories, chance: Tensor) -> None:
+        """End a share of the histories in the fail state."""
+        self.sums.return_mean += self.task.fail_reward * (seen.weight * seen.discount * chance).sum().item()
+
+    def _arrive(self, histories: _Histories) -> None:
+        """End all histories, which have just taken the step to their end states."""
+        graph = self.task.graph
+        leaf = histories.node - graph.first_node(graph.depth)
+        before = histories.discount / self.gamma if self.gamma else torch.zeros_like(histories.discount)
+        self.sums.return_mean += (histories.weight * before * self.paid[leaf]).sum().item()
+        self.sums.success_rate += histories.weight[leaf == self.task.goal_leaf].sum().item()
+        self.sums.end_rate += histories.weight.sum().item()
+        if self.task.extra_end_step:
+            self._count_steps(histories)
+
+
+def _parts(histories: _Histories) -> Iterator[_Histories]:
+    """Yield parts of histories that are played at once; none where there is none."""
+    for rows in torch.arange(len(histories.node)).split(HISTORIES_AT_ONCE):
+        if len(rows):
+            yield histories.select(rows)
+
+
+def _joined(parts: Sequence[_Histories]) -> _Histories:
+    """Return histories as one."""
+    state = {key: torch.cat([part.state[key] for part in parts]) for key in parts[0].state}
+    node, weight, discount = (
+        torch.cat([getattr(part, name) for part in parts]) for name in ("node", "weight", "discount")
+    )
+    return _Histories(node, weight, discount, state)
