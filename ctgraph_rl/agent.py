@@ -37,7 +37,7 @@ class Agent(Protocol):
 
     For ``evaluation.exact=true`` it has ``action_probs(data)``, which returns the probabilities of all actions, float
     [n, A], as the exploration type says, and its next state, by ``("next", key)``, as far as the action does not
-    decide it. It draws nothing, and what it returns for a row depends on that row alone.
+    decide it. It draws nothing, and treats each row as if there were no other.
     """
 
     def policy_for(self, task: int) -> TensorDictModuleBase:

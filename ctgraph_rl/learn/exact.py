@@ -24,7 +24,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ctgraph_rl.checks import Rule, fraction, require
 from ctgraph_rl.core.graph import WAIT_ACTION, StateType
 from ctgraph_rl.core.rewards import Arrival
-from ctgraph_rl.learn.collect import PREVIOUS_ACTION, TRIAL, InitialState, Policy, Step
+from ctgraph_rl.learn.collect import PREVIOUS_ACTION, TRIAL, InitialState, Step
 from ctgraph_rl.learn.logits_policy import as_policy
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.task_like import TaskLike
@@ -47,8 +47,8 @@ ActionProbs = Callable[[Tensor], Tensor]
 
 @torch.no_grad()
 def exact_measures(
-    policy: Policy,
-    task: Task,
+    policy: Any,
+    task: TaskLike,
     *,
     greedy: bool,
     initial_state: InitialState | None = None,
@@ -72,6 +72,7 @@ def exact_measures(
     """
     start = {} if initial_state is None else dict(initial_state(1).items())
     require(*exact_rules(policy, task, start))
+    assert isinstance(task, Task)  # as the rules say
     shown = _Shown(task, tuple(task.observation_shape if shape is None else shape), task_id)
     exploration = ExplorationType.DETERMINISTIC if greedy else ExplorationType.RANDOM
     with set_exploration_type(exploration):
@@ -113,7 +114,7 @@ def exact_value(policy: ActionProbs | nn.Module, task: Task, gamma: float = 1.0)
     return _of_function(policy, task, gamma).return_mean
 
 
-def exact_rules(policy: Policy, task: TaskLike, start: Step) -> Iterator[Rule]:
+def exact_rules(policy: object, task: TaskLike, start: Step) -> Iterator[Rule]:
     """Yield the rules for exact measures: what of a policy and a task has none, and what to do.
 
     Args:
@@ -344,7 +345,8 @@ class _Enumeration:
                 branch = torch.full_like(after.node, decision)
                 swap = self.task.swapped_branches
                 if swap is not None and decision in swap[1]:
-                    branch = torch.where(after.node == self.task.swapped_node, sum(swap[1]) - decision, branch)
+                    at_swap = after.node.eq(self.task.swapped_node)  # type: ignore[arg-type]
+                    branch = torch.where(at_swap, sum(swap[1]) - decision, branch)
                 after.node = after.node * b + branch
                 self._at_wait(after, level + 1)
 
