@@ -1,4 +1,4 @@
-"""How fast agents learn on one device: ``python -m baselines.benchmark --device cuda``.
+"""How fast agents learn on one device: ``python -m benchmarks.agents --device cuda``.
 
 PPO and LSTM-PPO learn as in a run: step by step, captured, and PPO compiled as well. Many seeds learn as one job, with
 stacked weights. The yardstick is the environment with given actions, on the same device and in the same run.

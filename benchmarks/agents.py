@@ -1,4 +1,4 @@
-"""How fast agents learn, beside Stable-Baselines3: python -m baselines.benchmark.
+"""How fast agents learn, beside Stable-Baselines3: python -m benchmarks.agents.
 
 Every agent learns with the settings of its yaml file on 256 rows, Stable-Baselines3's with the same ones as far as it
 has them: on ctgraph_rl.sb3.SB3VecEnv, and on what its make_vec_env makes of the single environment; and with its
@@ -219,7 +219,7 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
         ValueError: for numbers out of range.
     """
     names = list(dict.fromkeys(name for name, _ in PAIRS))
-    parser = argparse.ArgumentParser(prog="python -m baselines.benchmark", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.agents", description=__doc__)
     parser.add_argument("--agents", nargs="+", default=names, choices=names, help="who is measured")
     known = [entry.name for entry in catalogue("cell")]
     parser.add_argument("--cells", nargs="*", choices=known, help="instead: lstm_ppo with these cells; none named: all")

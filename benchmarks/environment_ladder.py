@@ -1,4 +1,4 @@
-"""The environment on one device, from step by step to fused: ``python -m ctgraph_rl.benchmark --device cuda``.
+"""The environment on one device, from step by step to fused: ``python -m benchmarks.environments --device cuda``.
 
 The yardstick is a copy of as many bytes as the observations have, on the same device and in the same run.
 """

@@ -287,7 +287,7 @@ def machine(device: torch.device | None = None) -> str:
 def _options(arguments: list[str] | None) -> argparse.Namespace:
     """Return the options of the command line."""
     names = list(configurations())
-    parser = argparse.ArgumentParser(prog="python -m ctgraph_rl.benchmark", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.environments", description=__doc__)
     parser.add_argument("--rows", type=int, nargs="+", help="batch sizes")
     parser.add_argument("--tasks", nargs="+", default=names, choices=names, help="what is measured")
     parser.add_argument("--rounds", type=int, default=5, help="how often each is measured")
@@ -328,3 +328,7 @@ def main(arguments: list[str] | None = None) -> None:
             one.measure(options.seconds)
     found = [one for one in measured if one.speeds]
     print(f"{machine()}; medians of {options.rounds} rounds\n\n{table(found)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,4 +1,4 @@
-"""Stable-Baselines3's agents with the hyperparameters of ours, for `baselines.benchmark`."""
+"""Stable-Baselines3's agents with the hyperparameters of ours, for `benchmarks.agents`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The packages that this one finds by name: `curricula`, `baselines`, `benchmarks`, and the yaml files in ``conf``."""
+"""The packages that this one finds by name: `curricula`, `baselines`, and the yaml files in ``conf``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from ctgraph_rl.checks import ReadOnlyValues, require
@@ -90,20 +89,6 @@ def _shadows(*names: str) -> Iterator[str]:
         if found != ours:
             kind = "file" if found == origin else "folder"
             yield f"package {name!r} was found in {found} instead of {ours}; rename or move the {kind} found"
-
-
-def speed_suite(name: str) -> ModuleType:
-    """Return a module of ``benchmarks``, which measure speed and are beside this package in a checkout only.
-
-    Raises:
-        ImportError: if this package was installed from a wheel.
-        ValueError: if another package is named ``benchmarks``, too; names it.
-    """
-    if not (HERE.parent / "benchmarks" / f"{name}.py").is_file():
-        raise ImportError(f"benchmarks/{name}.py is in a checkout of ctgraph_rl and not in its wheel: run it there")
-    require(*((False, message) for message in _shadows("benchmarks")))
-    with first_imports():
-        return import_module(f"benchmarks.{name}")
 
 
 def import_agents(config_dir: Path) -> list[str]:
@@ -200,9 +185,8 @@ def class_named(module: str, name: str) -> type | None:
     check_packages()
     if find_spec(module) is None:
         return None
-    home = import_module(module)  # its name is another one if it moved
-    kind = getattr(home, name, None)
-    return kind if isinstance(kind, type) and kind.__module__ == home.__name__ else None
+    kind = getattr(import_module(module), name, None)
+    return kind if isinstance(kind, type) and kind.__module__ == module else None
 
 
 def profile_properties() -> ReadOnlyValues:

@@ -32,7 +32,7 @@ FLOORS = (
     ("visualize", "hydra_plugins"),
     ("report",),
     ("collective", "board", "profile"),
-    ("cli", "run", "describe", "compare", "testing", "benchmark"),
+    ("cli", "run", "describe", "compare", "testing"),
     ("benchmarks",),
 )
 """Wings, lower ones first: each imports what is below, and itself; those of one floor do not import each other."""
@@ -67,8 +67,7 @@ KNOW_HYDRA = (
 
 DOORS = {
     "ctgraph_rl": "its names are imported when they are first used",
-    "baselines": "former names of its modules",
-    "ctgraph_rl.packages": "the only door to curricula, baselines and benchmarks",
+    "ctgraph_rl.packages": "the only door to curricula and baselines",
     "ctgraph_rl.board.relearn": "learners of others, in a process of their own",
     "ctgraph_rl.log.sources": "looks for modules of the user, and imports none",
     "ctgraph_rl.metrics": "all of its own modules, so that no metric is left out",

@@ -149,7 +149,7 @@ class ADWIN(Detector):
         self.start_label(state["label"], state["is_trial"])
         self.kept = {label: Returns(*each) for label, each in state["kept"].items()}
         self.returns = state["returns"].tolist()
-        self.is_whole = state.get("is_whole")
+        self.is_whole = state["is_whole"]
         for each in () if self.is_trial else self.returns:
             self.window.update(each)
 

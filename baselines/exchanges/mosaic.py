@@ -222,7 +222,7 @@ class Mosaic(MaskExchange):
         """Restore what `state_dict` returned."""
         super().load_state_dict(state)
         self.known = [KnownMask(**each) for each in state["known"]]
-        self._expect(tuple(state.get("shape", ())))
+        self._expect(tuple(state["shape"]))
         self.generator.set_state(state["random"])
 
 

@@ -169,9 +169,6 @@ class Curriculum:
         announced = self.protocol.boundaries == "announced"
         return tuple((block,) for block in self.blocks) if announced else (self.blocks,)
 
-    stretches = segments
-    """The former name of `segments`."""
-
     @property
     def task_ids(self) -> dict[TaskLike, int]:
         """The id of each of ``tasks``."""

@@ -158,7 +158,7 @@ class Samples:
     def restore(self, state: ReadOnlyValues, device: torch.device) -> None:
         """Restore what `state` returned."""
         self.clear()
-        for part in state.get("parts", [state]):  # a single one, as earlier versions saved it
+        for part in state["parts"]:
             split = {key: value.to(device).split(part["sizes"]) for key, value in part["items"].items()}
             self.minibatches += [dict(zip(split, values, strict=True)) for values in zip(*split.values(), strict=True)]
         self.num_held = sum(map(num_learnt, self.minibatches))

@@ -20,7 +20,6 @@ STORED = Path(__file__).with_name("sample.json")
 PACKAGES = ("baselines", "ctgraph_rl", "curricula", "hydra_plugins")
 
 EXCLUDED = {
-    "ctgraph_rl/benchmark": "imports what measures speed",
     "ctgraph_rl/core/region.py": "captures on a GPU",
 }
 """Modules of which nothing is drawn, and why. Texts, imports and annotations are left out by the operators."""
