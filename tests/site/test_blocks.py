@@ -15,6 +15,7 @@ import sys
 from argparse import ArgumentParser
 from collections.abc import Callable, Iterator
 from doctest import ELLIPSIS, NORMALIZE_WHITESPACE, OutputChecker
+from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
 
@@ -183,7 +184,7 @@ def module(name: str, words: list[str], folder: Path, monkeypatch: pytest.Monkey
         if name in command:
             follow([command[name], *words], folder, monkeypatch)
         else:
-            parse(lambda: packages.command(f"{name}.__main__")(), [name, *words], monkeypatch)
+            parse(import_module(name).main, [name, *words], monkeypatch)
 
 
 def follow(words: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
