@@ -14,10 +14,11 @@ from ctgraph_rl.checks import NamedValues, require
 from ctgraph_rl.collective.summary import COLLECTIVE, RUN, WHAT, Collective, read_collective, tables
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.log.escape import csv_text, markdown_table, markdown_text
-from ctgraph_rl.log.files import locked
+from ctgraph_rl.log.files import METRICS, locked
 from ctgraph_rl.metrics.record import MASTERED
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, Gallery
 from ctgraph_rl.report.style import MOST_AGENTS, WIDTH, agent_style, new_figure, require_packages, short
+from ctgraph_rl.report.terminal import print_note
 from ctgraph_rl.strict import files_below
 
 MEASURES = ("learning_time", "share_learned", "final_return")
@@ -43,17 +44,24 @@ MOST_MAPS = 12
 
 
 def find_collectives(paths: Sequence[Path | str]) -> list[Collective]:
-    """Return every collective in or below some folders.
+    """Return every finished collective in or below some folders; others are named on standard error.
 
     Raises:
         ValueError: if there is none; and see `read_collective`.
     """
-    folders: dict[Path, None] = {}
+    folders: dict[Path, bool] = {}
     for path in paths:
         for log in files_below(Path(path), (COLLECTIVE,))[0]:
-            folders[log.parent] = None
-    require((bool(folders), f"no {COLLECTIVE} in or below {', '.join(map(str, paths))}: run one with exchange=l2d2c"))
-    return list(map(read_collective, folders))
+            folders[log.parent] = (log.parent / METRICS).exists()
+    unfinished = [folder for folder, finished in folders.items() if not finished]
+    where = ", ".join(map(str, paths))
+    require(
+        (bool(folders), f"no {COLLECTIVE} in or below {where}: run one with exchange=l2d2c"),
+        (not folders or any(folders.values()), f"no collective in or below {where} is finished: run it to its end"),
+    )
+    for folder in unfinished:
+        print_note("left out", f"{folder} is unfinished; the same command resumes it")
+    return [read_collective(folder) for folder, finished in folders.items() if finished]
 
 
 def write_report(paths: Sequence[Path | str], folder: Path) -> Path:

@@ -71,7 +71,9 @@ RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
     ),
     "block": (lambda value: is_int(value, 0, MOST), f"an integer in 0..{MOST:,}"),
     **dict.fromkeys(("task", "step"), (_is_task, f"an integer in 1..{MOST:,}")),
-    "frames": (lambda value: is_int(value, 0, MOST_FRAMES), "an integer in [0, 2**63)"),
+    **dict.fromkeys(
+        ("frames", "num_frames"), (lambda value: is_int(value, 0, MOST_FRAMES), "an integer in [0, 2**63)")
+    ),
     "held_out": (lambda value: isinstance(value, bool), "true or false"),
     **dict.fromkeys(("moment", "label"), (_is_text, "a text")),
     **dict.fromkeys(

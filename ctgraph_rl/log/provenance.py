@@ -62,6 +62,7 @@ def provenance(curriculum: Curriculum, names: Iterable[str] | None = ()) -> Name
         **code(curriculum, names),
         "tasks": list(curriculum.labels),
         "trained": [[number + 1 for number in block] for block in curriculum.trained],
+        "num_frames": curriculum.num_frames,
         "versions": versions(),
         **machine(),
         "cpu": cpu_model(),

@@ -310,13 +310,17 @@ class RunLog:
         return {block: _row(of_block) for block, of_block in values.items()}
 
     def last(self, name: str, num_tasks: int = 0) -> Tensor:
-        """A field of the last evaluation of each task at a boundary, float64 [tasks]; NaN where there is none.
+        """A field of the evaluation of each task after the last block, float64 [tasks]; NaN where there is none.
+
+        The last block is that of the curriculum, where the log says it.
 
         Args:
             name: the field.
             num_tasks: see `performance`.
         """
-        return self._matrix([{m["task"]: m.get(name) for m in self._evaluations(during=False)}], num_tasks)[0]
+        evaluations = self._evaluations(during=False)
+        block = len(self._said()) or max((m["block"] for m in evaluations), default=0)
+        return self._matrix([{m["task"]: m.get(name) for m in evaluations if m["block"] == block}], num_tasks)[0]
 
     def adaptation(self, held_out: bool = False) -> Adaptation | None:
         """Return the last evaluation with adaptation; None where there is none.

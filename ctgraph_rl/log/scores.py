@@ -12,9 +12,11 @@ from torch import Tensor
 
 from ctgraph_rl import metrics
 from ctgraph_rl.checks import NamedValues, require
+from ctgraph_rl.log.escape import listed
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.metrics import Curves, Metric, Undefined
 from ctgraph_rl.metrics.adaptation import Adaptation
+from ctgraph_rl.metrics.inputs import INPUTS
 from ctgraph_rl.metrics.labels import SEVERAL, Labelling
 from ctgraph_rl.metrics.record import float64
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -31,6 +33,9 @@ from ctgraph_rl.tasks.values import (
 
 GOAL_CHANGES = Undefined("ceilings are exact only for goals that stay, and a task has a goal_change")
 NO_EXPERTS = "no experts were given"
+AT_MOMENTS = "evaluate exactly where Curriculum.moments says"
+MOST_MOMENTS = 5
+"""Moments that a reason names."""
 
 
 def scores(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None = None) -> dict[str, Metric]:
@@ -63,28 +68,66 @@ def scores(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None
 
 
 def inputs_of(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None) -> NamedValues:
-    """Return all of `ctgraph_rl.metrics.inputs.INPUTS`, `Undefined` in place of what this run does not give."""
+    """Return all of `ctgraph_rl.metrics.inputs.INPUTS`, `Undefined` in place of what this run does not give.
+
+    A run that is not finished gives nothing of what it measured.
+    """
+    facts = _facts(curriculum)
+    try:
+        check_finished(log, curriculum)
+    except Undefined as reason:
+        return {name: facts.get(name, reason) for name in INPUTS}
+    return {**_measured(log, curriculum, facts["best"], experts), **facts}
+
+
+def check_finished(log: RunLog, curriculum: Curriculum) -> None:
+    """Refuse the log of a run without the last evaluation of its curriculum's protocol.
+
+    Raises:
+        Undefined: says how far it came.
+    """
+    reached = max((m["frames"] for m in log.of_kind("evaluation")), default=0)
+    last = curriculum.moments[-1]
+    if reached < last:
+        raise Undefined(f"the run is not finished: its last evaluation is after {reached:,} of {last:,} frames")
+
+
+def protocol_curves(log: RunLog, curriculum: Curriculum) -> Curves:
+    """Return the evaluation curves of a finished run that was evaluated where the protocol says, and nowhere else.
+
+    Areas, sums and maxima over evaluations of two runs compare only then.
+
+    Raises:
+        Undefined: for another run; names the moments that are missing, or too many.
+    """
+    check_finished(log, curriculum)
+    found = {m["frames"] for m in log.of_kind("evaluation") if not m.get("held_out")}
+    missing = sorted({*curriculum.moments} - found)
+    more = sorted(found - {*curriculum.moments})
+    if missing:
+        raise Undefined(f"evaluations are missing after {listed(missing, MOST_MOMENTS)} frames: {AT_MOMENTS}")
+    if more:
+        raise Undefined(f"the protocol has no evaluations after {listed(more, MOST_MOMENTS)} frames: {AT_MOMENTS}")
+    return log.curves(curriculum.trained)
+
+
+def _facts(curriculum: Curriculum) -> NamedValues:
+    """Return the inputs that are known before a run."""
     tasks = curriculum.tasks
-    best = optimal_values(tasks)
-    curves = _curves(log, curriculum)
-    return {
-        "performance": log.performance(len(tasks)),
+    known = {
         "trained": curriculum.trained,
-        "curves": curves,
         "mastered_returns": mastered_returns(tasks),
-        "best": best,
+        "best": optimal_values(tasks),
         "zero": lowest_returns(tasks),
-        "episodes": log.training("episodes"),
-        "returns": log.training("return_mean"),
-        "labelling": _labelling(log, curriculum),
-        "interval_best": _interval_best(log, curriculum, best),
-        **_first_blocks(log, curriculum),
-        **_of_graphs(log, tasks),
-        "adaptation": _adaptation(log, held_out=False),
-        "held_out_adaptation": _adaptation(log, held_out=True),
-        **_regimes(log, curriculum, best, experts),
-        **_areas(curves, best, experts, trapezoids=False),
-        **_areas(curves, best, experts, trapezoids=True),
+    }
+    if not are_graphs(tasks):
+        reason = Undefined(f"it is known of CT-graphs alone, and tasks are of {_kind(tasks)}")
+        return {**dict.fromkeys(OF_GRAPHS, reason), **known}
+    return {
+        **known,
+        **ceilings(tasks),
+        "random_frames": list(map(random_frames_to_goal, tasks)),
+        "search_episodes": [task.graph.expected_search_episodes for task in tasks],
     }
 
 
@@ -96,16 +139,51 @@ OF_GRAPHS = (
 """Inputs that only CT-graphs have."""
 
 
-def _of_graphs(log: RunLog, tasks: Sequence[TaskLike]) -> NamedValues:
-    """Return the inputs that only CT-graphs have, all but those of first blocks."""
-    if not are_graphs(tasks):
-        return dict.fromkeys(OF_GRAPHS, Undefined(f"it is known of CT-graphs alone, and tasks are of {_kind(tasks)}"))
+def _measured(
+    log: RunLog, curriculum: Curriculum, best: Tensor | Undefined, experts: Sequence[RunLog] | None
+) -> NamedValues:
+    """Return the inputs that a finished run has measured."""
+    count = len(curriculum.tasks)
+    curves: Curves | Undefined
+    try:
+        curves = protocol_curves(log, curriculum)
+    except Undefined as reason:
+        curves = reason
     return {
-        **ceilings(tasks),
-        "end_rates": log.last("end_rate", len(tasks)),
-        "success_rates": log.last("success_rate", len(tasks)),
-        "random_frames": list(map(random_frames_to_goal, tasks)),
-        "search_episodes": [task.graph.expected_search_episodes for task in tasks],
+        "performance": log.performance(count),
+        "curves": curves,
+        "end_rates": log.last("end_rate", count),
+        "success_rates": log.last("success_rate", count),
+        "adaptation": _adaptation(log, held_out=False),
+        "held_out_adaptation": _adaptation(log, held_out=True),
+        **_training(log, curriculum, best),
+        **_regimes(log, curriculum, best, experts),
+        **_areas(curves, best, experts, trapezoids=False),
+        **_areas(curves, best, experts, trapezoids=True),
+    }
+
+
+OF_TRAINING = (
+    *("episodes", "returns", "labelling", "interval_best"),
+    *("first_frames", "first_episodes", "first_success_rates"),
+)
+"""Inputs that training intervals give."""
+
+
+def _training(log: RunLog, curriculum: Curriculum, best: Tensor | Undefined) -> NamedValues:
+    """Return the inputs that training intervals give, which must reach to the end of the curriculum."""
+    reached = max((m["frames"] for m in log.of_kind("training")), default=0)
+    if 0 < reached < curriculum.num_frames:
+        reason = Undefined(
+            f"training is logged up to {reached:,} of {curriculum.num_frames:,} frames: log it to the end"
+        )
+        return dict.fromkeys(OF_TRAINING, reason)
+    return {
+        "episodes": log.training("episodes"),
+        "returns": log.training("return_mean"),
+        "labelling": _labelling(log, curriculum),
+        "interval_best": _interval_best(log, curriculum, best),
+        **_first_blocks(log, curriculum),
     }
 
 
@@ -206,14 +284,6 @@ def _known(value: Callable[[Task, float], float], task: Task) -> float:
         return math.nan
 
 
-def _curves(log: RunLog, curriculum: Curriculum) -> Curves:
-    """The evaluation curves; where nothing was evaluated, one evaluation without values."""
-    if any(not m.get("held_out") for m in log.of_kind("evaluation")):
-        return log.curves(curriculum.trained)
-    nothing = float64([math.nan] * len(curriculum.tasks)).unsqueeze(0)
-    return Curves(nothing, (0,), (0,), curriculum.trained)
-
-
 def _interval_best(log: RunLog, curriculum: Curriculum, best: Tensor | Undefined) -> Tensor | Undefined:
     """Return the optimum of the block that each interval ends in; NaN where tasks of a block differ in it."""
     if isinstance(best, Undefined):
@@ -297,13 +367,18 @@ def _regimes(
     return {"regimes": prepared, "experts": Undefined(NO_EXPERTS) if experts is None else of_experts}
 
 
-def _areas(curves: Curves, best: Tensor | Undefined, experts: Sequence[RunLog] | None, trapezoids: bool) -> NamedValues:
+def _areas(
+    curves: Curves | Undefined, best: Tensor | Undefined, experts: Sequence[RunLog] | None, trapezoids: bool
+) -> NamedValues:
     """Return areas under curves for forward transfer; its definitions are of performance whose best is 1."""
     kind = "trapezoid_areas" if trapezoids else "areas"
     try:
         require((experts is not None, NO_EXPERTS))
-        if isinstance(best, Undefined):
-            raise best
+        for each in (best, curves):
+            if isinstance(each, Undefined):
+                raise each
+        assert isinstance(best, Tensor)
+        assert isinstance(curves, Curves)
         best_is_1 = torch.allclose(best, torch.ones_like(best), rtol=0, atol=1e-9)
         require((best_is_1, "the definition needs tasks whose optimal value is 1"))
         alone = [expert.curves([(0,)]) for expert in experts or ()]

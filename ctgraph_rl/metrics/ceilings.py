@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl.metrics.bounds import at_most_1, not_negative, of_performance
-from ctgraph_rl.metrics.record import HERE, defined, ratio
+from ctgraph_rl.metrics.record import HERE, Undefined, defined, ratio
 
 NO_GAP = 1e-12
 """Smallest gap between the best memoryless policy and the optimum."""
@@ -57,7 +57,7 @@ def optimal_performance(best: Tensor) -> Tensor:
     "mean over tasks with m_j < best_j of (R[last,j] - m_j) / (best_j - m_j)",
     HERE,
     partial=True,
-    missing="memory gains nothing there, or an evaluation is missing",
+    missing="memory gains nothing there",
     bounds=at_most_1,
 )
 def memory_gap_closed(performance: Tensor, memoryless_ceilings: Tensor, best: Tensor) -> Tensor:
@@ -71,6 +71,8 @@ def memory_gap_closed(performance: Tensor, memoryless_ceilings: Tensor, best: Te
         memoryless_ceilings: as for `memoryless_ceiling`.
         best: each task's `Task.optimal_value(1.0)`.
     """
+    if performance[-1].isnan().any():
+        raise Undefined("the last evaluation of a task is missing")
     gap = best - memoryless_ceilings
     return ratio(performance[-1] - memoryless_ceilings, torch.where(gap > NO_GAP, gap, 0.0))
 

@@ -58,6 +58,11 @@ class Curves:
         """Positions of the evaluations in and after a block."""
         return list(range(bisect_left(self.blocks, block), bisect_right(self.blocks, block)))
 
+    def check_whole(self) -> None:
+        """Leave the metric undefined where there is no evaluation in the last block."""
+        if self.blocks[-1] < len(self.trained):
+            raise Undefined(f"the last evaluation is in block {self.blocks[-1]} of {len(self.trained)}")
+
     @property
     def ends(self) -> Tensor:
         """The performance matrix: the last evaluation of each block, [blocks + 1, tasks]; NaN for a block without."""
@@ -149,6 +154,7 @@ def _final(curves: Curves, last: int) -> Tensor:
 @defined("ben-iwhiwhu2022/icr", "sum_j p_j(end)", LABS, aggregate=lambda returns: returns[-1], bounds=of_sums)
 def instant_cumulative_return(curves: Curves) -> Tensor:
     """ICR(t) = sum_j p_j(t): the return over all tasks at evaluation t; the value is the last, the terms are all."""
+    curves.check_whole()
     return curves.performance.sum(1)
 
 
@@ -158,6 +164,7 @@ def total_performance_over_time(curves: Curves) -> Tensor:
 
     It grows with the number of evaluations, so compare equal protocols only.
     """
+    curves.check_whole()
     return curves.performance[[block > 0 for block in curves.blocks]].sum(1)
 
 
@@ -176,6 +183,7 @@ def relative_forgetting(curves: Curves) -> Tensor:
     last one must be there. A task that never got above 0 has no value and is left out and counted. In [0, 1] for
     performance that is.
     """
+    curves.check_whole()
     if curves.performance[-1].isnan().any():
         raise Undefined("the last evaluation of a task is missing")
     best = curves.performance.nan_to_num(nan=-torch.inf).amax(0)

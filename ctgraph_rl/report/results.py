@@ -44,18 +44,22 @@ SHOWN = (*(metric.__name__ for metric in metrics.SUMMARY), "solved_rate")
 _HERE = metrics.record.HERE
 AT_END = {
     "mean_final_return": metrics.Definition(
-        f"{_HERE}/mean-return-at-end", "mean over tasks of the mean return at their last evaluation", _HERE
+        f"{_HERE}/mean-return-at-end", "mean over tasks of the mean return after the last block", _HERE
     ),
     "solved_rate": metrics.Definition(
-        f"{_HERE}/share-solved-at-end>={SOLVED}", f"share of tasks with a last success rate >= {SOLVED}", _HERE
+        f"{_HERE}/share-solved-at-end>={SOLVED}",
+        f"share of tasks with a success rate >= {SOLVED} after the last block",
+        _HERE,
     ),
     "interquartile_return": metrics.Definition(
         "agarwal2021/iqm",
-        "mean of the middle half of the mean returns at the last evaluations of all tasks and seeds",
+        "mean of the middle half of the mean returns of all tasks and seeds after the last block",
         "Agarwal et al. 2021, Deep RL at the edge of the statistical precipice (arXiv 2108.13264)",
     ),
     "solved": metrics.Definition(
-        f"{_HERE}/solved-at-end>={SOLVED}", f"share of seeds whose last success rate on the task is >= {SOLVED}", _HERE
+        f"{_HERE}/solved-at-end>={SOLVED}",
+        f"share of seeds with a success rate on the task >= {SOLVED} after the last block",
+        _HERE,
     ),
 }
 """Measures of how tasks ended, by the first word of their name; the others are metrics of runs."""
@@ -293,7 +297,7 @@ def _at_the_end(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[Me
 
 
 def _over_tasks(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[MeasureLine]:
-    """Means over tasks that are not held out, of what was measured last; a seed needs a value of each."""
+    """Means over tasks that are not held out, after the last block; a seed needs a value of each."""
     returns: list[float | None] = [None] * len(by_seed)
     solved = returns.copy()
     for place, run in enumerate(by_seed.values()):

@@ -231,16 +231,19 @@ def read_run(path: Path) -> Run:
         reason = str(error) if isinstance(error, ValueError) else f"{file}: a measurement lacks or misuses {error}"
         return Run(path, about, agent, settings, seed, reason=reason)
     metrics, why = _metrics(path, log)
-    success = {}
-    returns = {}
+    success: dict[str, float | None] = {}
+    returns: dict[str, float | None] = {}
     tasks: dict[str, None] = {}
+    last_block = len(about.get("trained") or ()) or max(m.get("block", 0) for m in log.measurements)
     for m in log.of_kind("evaluation") if metrics else ():
-        if m.get("moment") != "during":
-            label = label_of(m)
-            success[label] = m.get("success_rate")  # the last
+        label = label_of(m)
+        success.setdefault(label, None)
+        returns.setdefault(label, None)
+        if not m.get("held_out"):
+            tasks[label] = None
+        if m.get("moment") != "during" and m["block"] == last_block:
+            success[label] = m.get("success_rate")
             returns[label] = m.get("return_mean")
-            if not m.get("held_out"):
-                tasks[label] = None
     return Run(
         path,
         about,
@@ -299,11 +302,18 @@ def _metrics(path: Path, log: RunLog) -> tuple[NamedValues, str | None]:
     file = path / METRICS
     if not file.exists():
         torn = ", with a torn last line" if log.torn_lines else ""
-        return {}, f"{_failure(path) or 'unfinished'}{torn}"
+        return {}, f"{_failure(path) or _unfinished(log)}{torn}"
     try:
         return metrics_of(read_regular(file, MOST_BYTES_OF_METRICS)), None
     except (OSError, ValueError) as error:
         return {}, f"{file} cannot be read: {error}"
+
+
+def _unfinished(log: RunLog) -> str:
+    """Return how far a run came that is not finished."""
+    total = log.of_kind("run")[0].get("num_frames")
+    reached = max(m.get("frames", 0) for m in log.measurements)
+    return "unfinished" if total is None else f"unfinished: {reached:,} of {total:,} frames"
 
 
 def _failure(path: Path) -> str | None:

@@ -338,15 +338,25 @@ class Recorder:
         return dict(scores(self.log, self.curriculum))
 
     def close(self) -> None:
-        """Write tables and metrics, close the log and the logger, and remove the checkpoints."""
+        """Write tables and metrics, close the log and the logger, and remove the checkpoints.
+
+        A run without the last evaluation of the protocol is not finished: it gets no results and keeps its checkpoints.
+        """
         try:
             self._end()
             if self.run_dir is not None and self._lock is not None:
-                write_curriculum(self.curriculum, self.run_dir)
-                write_results(self.log, self.curriculum, self.run_dir)
-                self._checkpoints.clear()
+                self._write_results(self.run_dir)
         finally:
             self._release()
+
+    def _write_results(self, run_dir: Path) -> None:
+        last = self.moments[-1]
+        if self._evaluated < last:
+            print(f"{run_dir} is not finished: it needs the evaluation after {last:,} frames; resume=True goes on")
+            return
+        write_curriculum(self.curriculum, run_dir)
+        write_results(self.log, self.curriculum, run_dir)
+        self._checkpoints.clear()
 
     def _end(self) -> None:
         """Close the log and the logger."""

@@ -14,6 +14,7 @@ from helpers.sweeping import command_line, sweep
 from ctgraph_rl import RunLog, packages
 from ctgraph_rl.collective import __main__ as collectives
 from ctgraph_rl.collective import job
+from ctgraph_rl.collective.report import find_collectives
 from ctgraph_rl.collective.summary import metrics, read_collective
 from ctgraph_rl.runs.checkpoints import Checkpoints
 from ctgraph_rl.runs.load import load
@@ -242,6 +243,7 @@ def made(folder: Path, exchange: str, returns, helps=()) -> None:
     for sender, receiver in helps:
         log.append("help", round=0, block=1, frames=100, receiver=receiver, sender=sender, task_id=5)
     log.close()
+    (folder / "metrics.json").write_text("{}")
 
 
 NEVER = [0.0, 0.5, float("nan"), 0.3]
@@ -288,6 +290,17 @@ def test_the_page_on_collectives_has_a_row_and_a_map_for_each_and_tidy_tables(tm
     ]
     assert [(row["sender"], row["receiver"], row["task_id"]) for row in table("helps")] == [("0", "1", "5")]
     assert len(table("members")) == 2 + 4
+
+
+def test_an_unfinished_collective_is_left_out_by_name(tmp_path, capsys):
+    for name in ("one", "two"):
+        made(tmp_path / name, "E", [([1.0], [1.0])])
+    (tmp_path / "two" / "metrics.json").unlink()
+
+    assert [each.path.name for each in find_collectives([tmp_path])] == ["one"]
+    assert capsys.readouterr().err == f"left out: {tmp_path}/two is unfinished; the same command resumes it\n"
+    with pytest.raises(ValueError, match=r"no collective in or below .*two is finished: run it to its end"):
+        find_collectives([tmp_path / "two"])
 
 
 def test_a_folder_without_collectives_is_refused(monkeypatch, capsys):

@@ -20,6 +20,14 @@ OF_THE_TASKS = (
 )
 """Metrics that say what the tasks allow, whatever was learned."""
 
+COUNTING = (
+    *("instant_cumulative_return", "total_performance_over_time", "relative_forgetting", "stage_reached", "regret"),
+    *("tasks_learned", "frames_to_mastery", "online_return", "frames_to_first_reward", "adapted_return"),
+)
+"""Metrics that some evaluations, or some training, would be enough for."""
+
+OF_CURVES = ("continual_world_performance", *COUNTING[:3], *COUNTING[5:7])
+
 TASKS = ct_su_b1((1, 1)), ct_su_b1((1, 2))
 CURRICULUM = Curriculum("two", 1, "here", (Block(TASKS[0], 200), Block(TASKS[1], 200)), Evaluation(every=100))
 
@@ -84,7 +92,8 @@ def test_what_is_known_in_closed_form_is_taken_from_the_tasks(log):
 
 
 def test_tasks_are_learned_by_the_share_of_their_own_optimum():
-    doubled = replace(CURRICULUM, blocks=(CURRICULUM.blocks[0], Block(replace(TASKS[1], goal_reward=2.0), 200)))
+    blocks = CURRICULUM.blocks[0], Block(replace(TASKS[1], goal_reward=2.0), 200)
+    doubled = replace(CURRICULUM, blocks=blocks, evaluation=Evaluation())
     log = RunLog()
     for block, returns in ((0, (0.0, 0.0)), (1, (0.95, 0.0)), (2, (0.0, 1.5))):
         if block:
@@ -194,7 +203,7 @@ def test_a_task_trained_again_leaves_transfer_undefined_for_that_reason(log):
 def test_one_evaluation_a_block_has_a_mean_and_no_trapezoid(log):
     log.measurements = [m for m in log.measurements if m.get("moment") != "during"]
 
-    found = scores(log, CURRICULUM, [expert(0.5), expert(0.5)])
+    found = scores(log, replace(CURRICULUM, evaluation=Evaluation()), [expert(0.5), expert(0.5)])
 
     assert found[TRANSFER[0]].terms == (1.0, 1.0)
     assert found[TRANSFER[1]].undefined == "areas by trapezoids need 2 evaluations, task 1 has 1 in its block"
@@ -222,20 +231,51 @@ def test_an_end_step_more_is_in_the_frames_of_the_random_policy(log):
     assert scores(log, reference)["frames_to_first_reward"].terms == pytest.approx([55 / 654, (100 + 110 / 6) / 654])
 
 
-def test_a_log_that_stops_early_or_has_no_evaluation_has_scores():
-    log = RunLog()
-    log.append("run", trained=[[1], [2]])
-    train(log, 1, 200, 10, 5)
+@pytest.mark.parametrize("reached", [0, 100, 200, 300])
+def test_a_run_that_is_not_finished_has_no_value_but_those_of_its_tasks(log, reached):
+    log.measurements = [m for m in log.measurements if m["frames"] <= reached]
 
     found = scores(log, CURRICULUM)
 
-    assert found["frames_to_first_reward"].terms[1] is None
-    assert found["frames_to_first_reward"].terms[0] > 0
-    assert {name for name, metric in found.items() if metric.value is not None} == {
-        "regret",
-        "online_return",
-        *OF_THE_TASKS,
-    }
+    assert {name for name, metric in found.items() if metric.value is not None} == {*OF_THE_TASKS}
+    reason = f"the run is not finished: its last evaluation is after {reached} of 400 frames"
+    assert {found[name].undefined for name in COUNTING} == {reason}
+
+
+def test_training_that_is_not_logged_to_the_end_has_no_sums(log):
+    log.measurements = [m for m in log.measurements if m["kind"] != "training" or m["frames"] < 400]
+
+    found = scores(log, CURRICULUM)
+
+    reason = "training is logged up to 300 of 400 frames: log it to the end"
+    assert {found[name].undefined for name in ("regret", "online_return", "search_efficiency")} == {reason}
+    assert found["average_performance"].value == 0.625
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({300: None}, "evaluations are missing after 300 frames"),
+        ({100: None, 0: None}, "evaluations are missing after 0, 100 frames"),
+        ({100: 150}, "evaluations are missing after 100 frames"),
+        ({100: (100, 120, 140)}, "the protocol has no evaluations after 120, 140 frames"),
+    ],
+)
+def test_curves_that_were_not_measured_where_the_protocol_says_give_no_area_and_no_sum(log, changed, reason):
+    measured = []
+    for m in log.measurements:
+        frames = m["frames"]
+        moments = changed.get(frames, frames) if m["kind"] == "evaluation" else frames
+        for moment in moments if isinstance(moments, tuple) else [moments]:
+            if moment is not None:
+                measured.append({**m, "frames": moment})
+    log.measurements = sorted(measured, key=lambda m: m["frames"])
+
+    found = scores(log, CURRICULUM, [expert(0.5, 0.5), expert(0.5, 0.5)])
+
+    explained = f"{reason}: evaluate exactly where Curriculum.moments says"
+    assert {found[name].undefined for name in (*OF_CURVES, *TRANSFER)} == {explained}
+    assert found["average_performance"].value == 0.625
 
 
 def test_frames_count_from_where_the_curriculum_says_that_a_block_starts(log):
@@ -275,21 +315,6 @@ def test_an_optimum_that_is_not_known_is_said(log, monkeypatch):
     assert found["mean_training_performance"].undefined == "a task's optimal value is not known: its graph is too large"
 
 
-def test_a_run_that_was_hardly_evaluated_has_undefined_scores_and_does_not_fail():
-    log = RunLog()
-    for block in (1, 2):
-        train(log, block, 200 * block, 10, 5)
-    evaluate(log, "during", 1, 100, 0.5)
-
-    found = scores(log, CURRICULUM)
-
-    defined = {name for name, metric in found.items() if metric.value is not None}
-    of_training = {"regret", "online_return", "frames_to_first_reward", "search_efficiency"}
-    assert defined == {*of_training, *OF_THE_TASKS}
-    assert found["performance_recovery"].undefined == "lifelong metrics need an evaluation of every task"
-    assert found["average_performance"].n_undefined == found["normalised_performance"].n_undefined == 2
-
-
 def test_no_score_is_infinite_or_nan(log):
     values = [metric.value for metric in scores(log, CURRICULUM, [expert(1.0, 1.0), expert(0.0, 0.0)]).values()]
 
@@ -309,13 +334,14 @@ def test_what_is_lost_and_what_is_nothing_are_of_the_task_of_each_block(log):
 
 def test_first_rewards_are_of_the_first_block_of_a_task(log):
     again = replace(CURRICULUM, blocks=(*CURRICULUM.blocks, Block(TASKS[0], 200)))
-    train(log, 3, 500, 1, 1)
+    train(log, 3, 600, 1, 1)
+    evaluate(log, "after", 3, 600, 1.0, 1.0)
 
     assert scores(log, again)["search_efficiency"].terms[0] == pytest.approx(2.5 / (11 / 2))
 
 
 def test_each_transfer_has_its_own_area():
-    alone = replace(CURRICULUM, blocks=(Block(TASKS[0], 300),))
+    alone = replace(CURRICULUM, blocks=(Block(TASKS[0], 300),), evaluation=Evaluation(every=100, before=False))
     uneven, flat = expert(0.0, 0.0, 0.75), expert(0.0, 0.0, 0.0)
 
     found = scores(uneven, alone, [flat])
@@ -350,6 +376,7 @@ def test_ceilings_that_are_not_known_say_why_and_tasks_without_a_gap_close_none(
     plain, gradient = ct_fo_b1(), replace(ct_su_b1(), reward_fn=Gradient())
     log = RunLog()
     log.append("run", trained=[[1]])
+    evaluate(log, "after", 1, 100, 1.0)
     found = [scores(log, Curriculum("one", 1, "test", [Block(task, 100)])) for task in (plain, gradient)]
 
     assert "memory gains nothing there" in (found[0]["memory_gap_closed"].undefined or "")
@@ -358,6 +385,7 @@ def test_ceilings_that_are_not_known_say_why_and_tasks_without_a_gap_close_none(
         assert reason.startswith("the memoryless ceiling is exact only for the Needle reward")
     of_four = RunLog()
     of_four.append("run", trained=[[1, 2, 3, 4]])
+    evaluate(of_four, "after", 1, 204_800, 1.0)
     changing = scores(of_four, curricula.load("su_b1_changing_goals"))
     for name in ("open_loop_ceiling", "memoryless_ceiling", "memory_gap_closed"):
         assert (changing[name].undefined or "").startswith("ceilings are exact only for goals that stay")

@@ -25,7 +25,13 @@ def log_of(*lines: tuple[int, int, int, int, int, int]) -> RunLog:
     for block, frames, label, learned, alarm, back in lines:
         own = {"acted_label": label, "learned": learned, "alarm": alarm, "rolled_back": back}
         log.append("training", block=block, frames=frames, episodes=10, return_mean=frames / 1200, **own)
+    evaluate_at_end(log)
     return log
+
+
+def evaluate_at_end(log: RunLog) -> None:
+    last = log.measurements[-1]
+    log.append("evaluation", moment="after", block=last["block"], frames=last["frames"], task=1, return_mean=1.0)
 
 
 BY_HAND = log_of(
@@ -123,6 +129,7 @@ def test_a_run_without_labels_says_so_and_has_an_online_return():
     log = RunLog()
     log.append("training", block=1, frames=600, episodes=3, return_mean=0.5)
     log.append("training", block=2, frames=1200, episodes=0, return_mean=math.nan)
+    evaluate_at_end(log)
 
     metrics = found(log, of(Block(ONE, 600), Block(TWO, 600)))
 

@@ -214,16 +214,16 @@ def test_a_recorded_run_is_scored_and_what_was_not_run_is_a_gap(tmp_path):
 
 @pytest.mark.parametrize("order", [1, -1])
 def test_a_modified_curriculum_counts_where_the_published_one_has_no_score(tmp_path, order):
-    def record(name: str, at: int | None, **changes: int) -> Path:
+    def record(name: str, finished: bool, **changes: int) -> Path:
         curriculum = curricula.load("profile_attention", **changes)
         with Recorder(curriculum, tmp_path / name, about={"agent": "Mine"}) as recorder:
-            if at is not None:
-                recorder.evaluate(lambda images: torch.zeros(len(images), dtype=torch.int64), at)
+            if finished:
+                recorder.evaluate(lambda images: torch.zeros(len(images), dtype=torch.int64), curriculum.num_frames)
         return tmp_path / name
 
-    modified = record("modified", 1024, num_frames=1024)
-    begun = record("begun", None)
-    published = record("published", 0)
+    modified = record("modified", True, num_frames=1024)
+    begun = record("begun", False)
+    published = record("published", True)
 
     reasons = []
     for other in (begun, published):

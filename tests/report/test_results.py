@@ -9,13 +9,15 @@ import sys
 import pytest
 import torch
 from helpers.made_runs import all_runs, line, make_run
+from helpers.scripted import DECISION_ID, ONE, TWO, curriculum
 
-from ctgraph_rl import metrics, parsers
+from ctgraph_rl import Block, metrics, parsers
 from ctgraph_rl.log.run_log import write_metrics
 from ctgraph_rl.report import formats, results
 from ctgraph_rl.report.results import comparisons, selected, table
 from ctgraph_rl.runs.experts import EXPERT
 from ctgraph_rl.runs.read import Problem, find_runs, grouped
+from ctgraph_rl.runs.recorder import Recorder
 
 pytest.importorskip("scipy")
 
@@ -71,6 +73,47 @@ def test_an_unfinished_run_and_a_missing_one_are_shown(tmp_path):
 
     assert str(row.estimate) == "0.75 n = 1/3"
     assert row.note == "seed 1: unfinished; seed 2: no run; one seed has no interval"
+
+
+def test_seeds_that_were_closed_after_a_quarter_are_in_no_statistic_and_are_named(tmp_path):
+    learned = curriculum(*(Block(task, 12) for task in (ONE, TWO, ONE, TWO)))
+
+    def record(seed: int, agent: str, quarters: int) -> None:
+        with Recorder(learned, tmp_path / agent / str(seed), seed=seed, about={"learner": agent}) as recorder:
+            for frames in (0, *learned.ends[:quarters]):
+                recorder.evaluate(lambda images: images[:, DECISION_ID].astype(int), frames)
+
+    for seed in range(3):
+        record(seed, "early", 1)
+        record(seed, "mixed", 4 if seed else 3)
+        record(seed, "whole", 4)
+    runs = all_runs([tmp_path])
+
+    rows = table(runs)
+    assert line(rows, "every_metric", "early").note == "seed 0, 1, 2: unfinished: 12 of 48 frames; no seed has a value"
+    assert [row.measure for row in rows if row.agent == "early"] == ["every_metric"]
+    for name in ("solved_rate", "mean_final_return", "instant_cumulative_return", "stage_reached"):
+        mixed = line(rows, name, "mixed")
+        assert mixed.estimate.n == 2
+        assert mixed.note.startswith("seed 0: unfinished: 36 of 48 frames")
+    pairs = comparisons(runs, "instant_cumulative_return")
+    assert pairs["scripted", "mixed", "whole"].difference.n == 2
+    assert pairs["scripted", "early", "whole"].difference.n == 0
+
+
+def test_a_task_without_an_evaluation_after_the_last_block_leaves_the_rates_without_a_value(tmp_path):
+    path = make_run(tmp_path, 0)
+    kept = []
+    for text in (path / "run.jsonl").read_text().splitlines():
+        m = json.loads(text)
+        if (m["kind"], m.get("block"), m.get("task")) != ("evaluation", 2, 1):
+            kept.append(text)
+    (path / "run.jsonl").write_text("\n".join(kept) + "\n")
+
+    rows = table(all_runs([tmp_path]))
+
+    assert line(rows, "solved_rate").estimate.value is line(rows, "mean_final_return").estimate.value is None
+    assert [line(rows, f"solved goal{task}").estimate.n for task in (1, 2)] == [0, 1]
 
 
 def test_an_undefined_metric_is_counted_with_its_reason(tmp_path):

@@ -13,6 +13,7 @@ import torch
 from helpers.scripted import DECISION_ID, ONE, TWO, Scripted, curriculum, decide
 
 from ctgraph_rl import Block, Evaluation, RunLog, learn_curriculum
+from ctgraph_rl.runs.read import read_run
 from ctgraph_rl.runs.recorder import Recorder
 from ctgraph_rl.runs.trackers import csv_logger
 from ctgraph_rl.runs.train import RESULTS
@@ -114,12 +115,12 @@ class Learner:
     def state_dict(self) -> dict:
         return {"batches": self.batches}
 
-    def learn(self, recorder: Recorder, stop: int | None = None) -> None:
+    def learn(self, recorder: Recorder, stop: int | None = None, until: int = TASKS.num_frames) -> None:
         """Learn the rest of a curriculum; a stop is an error after so many frames."""
         self.batches = (recorder.saved or self.state_dict())["batches"]
         if recorder.saved is None:
             recorder.evaluate(table(0), 0)
-        for frames in range(recorder.frames + 4, TASKS.num_frames + 1, 4):
+        for frames in range(recorder.frames + 4, until + 1, 4):
             self.batches += 1
             recorder.training(frames, loss=1 / self.batches)
             if frames in recorder.moments:
@@ -301,15 +302,20 @@ def test_an_evaluation_that_failed_can_be_made_again():
     assert recorder.evaluate(table(1), 0) == {"goal1": 1.0, "goal2": 0.0}
 
 
-@pytest.mark.parametrize("learned", [None, 12])
-def test_a_recorder_that_is_closed_early_writes_its_files(tmp_path, learned):
-    with Recorder(TASKS, tmp_path) as recorder:
-        if learned:
-            recorder.training(learned, episodes=2, return_mean=0.5, success_rate=0.5)
+@pytest.mark.parametrize("stop", [0, 12, 24])
+def test_a_recorder_that_is_closed_early_leaves_a_run_to_be_resumed(tmp_path, capsys, stop):
+    with Recorder(TASKS, tmp_path / "run", about={"learner": "a table"}) as recorder:
+        if stop:
+            Learner().learn(recorder, until=stop)
 
-    written = json.loads((tmp_path / "metrics.json").read_text())
-    assert written["average_performance"]["value"] is None
-    assert written["regret"]["value"] == (1.0 if learned else None)
+    said = "is not finished: it needs the evaluation after 36 frames; resume=True goes on"
+    assert said in capsys.readouterr().out
+    run = read_run(tmp_path / "run")
+    assert (run.reason, run.metrics) == (f"unfinished: {stop} of 36 frames", {})
+
+    with Recorder(TASKS, tmp_path / "run", about={"learner": "a table"}, resume=True) as recorder:
+        Learner().learn(recorder)
+    assert read_run(tmp_path / "run").reason is None
 
 
 def test_changing_goals_that_are_only_held_out_need_rows_of_several_episodes():
