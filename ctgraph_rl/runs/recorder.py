@@ -352,7 +352,7 @@ class Recorder:
     def _write_results(self, run_dir: Path) -> None:
         last = self.moments[-1]
         if self._evaluated < last:
-            print(f"{run_dir} is not finished: it needs the evaluation after {last:,} frames; resume=True goes on")
+            print(f"{run_dir} is not finished: it needs the evaluation after {last:,} frames; resume=True resumes it")
             return
         write_curriculum(self.curriculum, run_dir)
         write_results(self.log, self.curriculum, run_dir)

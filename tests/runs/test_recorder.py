@@ -308,7 +308,7 @@ def test_a_recorder_that_is_closed_early_leaves_a_run_to_be_resumed(tmp_path, ca
         if stop:
             Learner().learn(recorder, until=stop)
 
-    said = "is not finished: it needs the evaluation after 36 frames; resume=True goes on"
+    said = "is not finished: it needs the evaluation after 36 frames; resume=True resumes it"
     assert said in capsys.readouterr().out
     run = read_run(tmp_path / "run")
     assert (run.reason, run.metrics) == (f"unfinished: {stop} of 36 frames", {})
