@@ -81,17 +81,19 @@ class OptimalPolicy(NavigationPolicy):
 
 
 class SearchPolicy(OptimalPolicy):
-    """Tries end states without replacement until it finds the goal, then stays with it.
+    """Tries end states without replacement until it finds the goal, then stays with it until an episode misses it.
 
-    Each row goes through the end states in order from a random one on, so the number of the episode that finds the goal
-    is uniform on 1..b^d and has the mean E[kappa] = (b^d + 1) / 2. An episode that is cut before it has passed the last
-    wait state is tried again.
+    It knows the graph, and of the goal only whether its own last episode reached it. Each row goes through the end
+    states in order from a random one on: the number of the episode that finds the goal is uniform on 1..b^d and has the
+    mean E[kappa] = (b^d + 1) / 2. Once a goal has been drawn again, episode i with it succeeds with probability
+    min(1, i / b^d), too, as the search begins with the last goal. An episode that is cut before the last wait state is
+    tried again.
     """
 
     def __init__(self, env: CTGraphEnv) -> None:
         super().__init__(env)
         self.target: Tensor | None = None
-        self.tried = torch.zeros_like(env.node, dtype=torch.bool)
+        self.missed = torch.zeros_like(env.node, dtype=torch.bool)
 
     def decision(self, tensordict: TensorDictBase) -> Tensor:
         """Return the decision of each row, in 1..b, for rows at a decision state."""
@@ -99,11 +101,12 @@ class SearchPolicy(OptimalPolicy):
         return self._towards(self.target)
 
     def action(self, tensordict: TensorDictBase) -> Tensor:
-        """The actions of all rows; a new episode tries the next end state, unless the last one was the goal."""
+        """The actions of all rows; a new episode tries the next end state if the last one ended without the goal."""
         if self.target is None:
             self.target = self._random_below(self.env.num_end_states)
-        over = tensordict.get("is_init").squeeze(-1) & self.tried & (self.target != self.env.goal_leaf)
-        self.target = torch.where(over, (self.target + 1) % self.env.num_end_states, self.target)
+        fails = tensordict.get("is_init").squeeze(-1) & self.missed
+        self.target = torch.where(fails, (self.target + 1) % self.env.num_end_states, self.target)
         arrives = (self.env.state_type == StateType.WAIT) & (self.env.node == self.env.first_leaf + self.target)
-        self.tried = arrives | (self.tried & (self.env.state_type == StateType.END))  # which may take one more action
+        misses = arrives & (self.target != self.env.goal_leaf)  # the goal of this episode: the next may have another
+        self.missed = misses | (self.missed & (self.env.state_type == StateType.END))  # which may take one more action
         return super().action(tensordict)

@@ -156,7 +156,10 @@ def other_metric(run: Path) -> None:
         (other_numbers, r"has changed since the runs, ctgraph_rl \(numbers version 0 before, 1 now\): run again"),
         (other_version, r"runs are of different versions, torch .* and 1.0: run all with one"),
         (unknown_code, "do not say of which source they are: run again from files, and with Recorder"),
-        (unfinished, r"tiny-seed1 has no results \(unfinished: 0 of 128 frames\): finish it, or account for it: failed: {1: why}"),
+        (
+            unfinished,
+            r"seed1 has no results \(unfinished: 256 of 256 frames\): finish it, or account for it: failed: {1: why}",
+        ),
         (failed, r"tiny-seed1 has no results \(failed: FloatingPointError: the loss is nan\): finish it"),
         (damage, "tiny-seed1 has files that are not as they were written, performance.csv: run it again"),
         (other_metric, "tiny-seed1 has metrics that its log does not give, average_performance 0.75 for 0"),

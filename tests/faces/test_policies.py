@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from helpers.oracles import surjective
 
-from ctgraph_rl import CTGraphEnv
+import curricula
+from ctgraph_rl import CTGraphEnv, evaluate
+from ctgraph_rl.metrics.adaptation import exact_search
 from ctgraph_rl.policies import NavigationPolicy, OptimalPolicy, RandomPolicy, SearchPolicy
 
 MIXED = [surjective(2, 3, goal=(1, 2, 2)), surjective(3, 2, goal=(3, 2))]
@@ -62,6 +65,41 @@ def test_the_searcher_tries_each_end_state_at_most_once_and_then_stays_with_the_
     assert (found == 3).any(1).all()
     assert all((row[index:] == 3).all() for row, index in zip(found, first, strict=True))
     assert first[0::2].max() <= 7 and first[1::2].max() <= 8
+
+
+ROWS = 2000
+
+
+@pytest.mark.parametrize("stays", [True, False])
+@pytest.mark.parametrize("extra_end_step", [True, False])
+def test_the_searcher_succeeds_in_each_episode_as_often_as_the_closed_form_says(stays, extra_end_step):
+    """Goals are drawn uniformly of four, and drawn again after eight episodes where they do not stay."""
+    goals = [(1, 1), (1, 2), (2, 1), (2, 2)]
+    tasks = []
+    for goal in goals:
+        task = replace(surjective(2, 2, goal=goal), extra_end_step=extra_end_step)
+        tasks.append(task if stays else replace(task, goal_change=(8, 8)))
+
+    ends = evaluate(SearchPolicy, tasks, 16 * ROWS // 4, seed=3, episodes_per_row=16)
+
+    success = (ends["outcome"] == 3).view(ROWS, 16).double()
+    life = exact_search(4, 8)
+    expected = torch.cat([life, torch.ones(8) if stays else life])
+    spread = 5 * (expected * (1 - expected) / ROWS).sqrt()
+    assert ((success.mean(0) - expected).abs() <= spread).all()
+
+
+def test_the_searcher_does_not_know_of_a_goal_that_it_has_not_met():
+    """In its first episode after a change it goes to the old goal, whatever the new one is."""
+    swapped = curricula.load("penn_a_swap", num_lives=1, num_rows=16).evaluation.held_out
+
+    ends = evaluate(SearchPolicy, swapped, 52 * 40, seed=1, episodes_per_row=52)
+
+    leaf = ends["leaf"].view(-1, 52)
+    success = (ends["outcome"] == 3).view(-1, 52)
+    assert success[:, 49].all()
+    assert (leaf[:, 50] == leaf[:, 49]).all()
+    assert success[:, 50].double().mean().item() == pytest.approx(1 / 4, abs=5 * math.sqrt(3 / 16 / len(leaf)))
 
 
 @pytest.mark.slow
