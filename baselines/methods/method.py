@@ -246,6 +246,11 @@ class AgentWithMethod(nn.Module):
         """The agent's method."""
         return cast(Method, self.agent.method)
 
+    @property
+    def unwrapped(self) -> Learner:
+        """The agent without its method."""
+        return self.agent
+
     def policy_for(self, task: int) -> TensorDictModuleBase:
         """Return the agent's policy, or a copy of it where the method has other weights for a task."""
         weights = self.method.task_weights(task)

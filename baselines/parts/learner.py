@@ -75,6 +75,11 @@ class Learner(TakesNumbers, nn.Module):
         self.num_steps = num_steps
         self.max_grad_norm = max_grad_norm
 
+    @property
+    def unwrapped(self) -> Learner:
+        """The agent itself: nothing is around it."""
+        return self
+
     def initial_state(self, num_envs: int) -> TensorDict:
         """Return an empty recurrent state."""
         return TensorDict(batch_size=[num_envs])

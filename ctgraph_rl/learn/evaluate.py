@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 import torch
@@ -20,7 +20,7 @@ from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.collect import InitialState, Policy, act, agent_specs, make_env, start_of_episodes
 from ctgraph_rl.learn.exact import exact_measures, shown_id
-from ctgraph_rl.learn.labels import policies_by_label
+from ctgraph_rl.learn.labels import task_policies
 from ctgraph_rl.learn.logits_policy import as_policy
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.metrics.adaptation import exact_search
@@ -202,7 +202,7 @@ class Evaluator:
         if moment is None:
             return
         tasks = self.tasks_at(frames)
-        policies = self._policies(agent, tasks, frames)
+        policies = task_policies(agent, self.curriculum, self.log, tasks, frames)
         if self.curriculum.evaluation.exact:
             self._measure(policies, frames, moment, agent.initial_state)
             return
@@ -279,15 +279,6 @@ class Evaluator:
             return named
         seen = {i + 1 for block in curriculum.trained[: curriculum.block_at(frames)] for i in block}
         return {task: name for task, name in named.items() if name[0] in seen or name[0] > len(curriculum.tasks)}
-
-    def _policies(self, agent: Agent, tasks: Collection[TaskLike], frames: int) -> Sequence[Policy]:
-        """Return the agent's policy for each task: where ids are given, or the agent has labels, they may differ."""
-        if hasattr(agent, "policy_for_label"):
-            return policies_by_label(agent, self.curriculum, self.log, tasks, frames)
-        if self.curriculum.protocol.task_id == "hidden":
-            return [agent.policy] * len(tasks)
-        ids = self.curriculum.task_ids
-        return [agent.policy_for(ids[task]) if task in ids else agent.policy for task in tasks]
 
 
 def _of_each(agent: Agent, policies: Sequence[Policy]) -> Policy:

@@ -55,22 +55,27 @@ def label_spans(log: RunLog) -> tuple[Span, ...]:
     return tuple(spans)
 
 
-def policies_by_label(
+def task_policies(
     agent: Any, curriculum: Curriculum, log: RunLog, tasks: Iterable[TaskLike], frames: int | None = None
 ) -> list[TensorDictModuleBase]:
-    """Return an agent's policy for each task by its most frequent label.
+    """Return an agent's policy for each task: the one for its id where ids are shown, else the same for all.
+
+    An agent that labels tasks itself has ``policy_for_label``, which is asked for the task's most frequent label.
 
     Args:
-        agent: labels tasks itself.
+        agent: what learns.
         curriculum: what it learns.
         log: of the run so far.
-        tasks: what is played. One that is held out has no label, and is played with the label that acts.
+        tasks: what is played. One that is not trained has no id and no label, and is played with `Agent.policy`.
         frames: of the run so far, while it lasts: the present task may have started after the log's last interval, and
             then has the label that acts.
     """
-    labels = task_labels(log, curriculum)
-    if frames:
-        for task in curriculum.trained[curriculum.block_at(frames) - 1]:
-            labels.setdefault(task, agent.label)
-    position = {task: number for number, task in enumerate(curriculum.tasks)}
-    return [agent.policy_for_label(labels.get(position[task])) if task in position else agent.policy for task in tasks]
+    if hasattr(agent, "policy_for_label"):
+        labels = task_labels(log, curriculum)
+        if frames:
+            for number in curriculum.trained[curriculum.block_at(frames) - 1]:
+                labels.setdefault(number, agent.label)
+        position = {task: number for number, task in enumerate(curriculum.tasks)}
+        return [agent.policy_for_label(labels.get(position[t])) if t in position else agent.policy for t in tasks]
+    ids = {} if curriculum.protocol.task_id == "hidden" else curriculum.task_ids
+    return [agent.policy_for(ids[task]) if task in ids else agent.policy for task in tasks]

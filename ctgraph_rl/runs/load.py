@@ -17,7 +17,7 @@ from tensordict.nn import TensorDictModuleBase
 from ctgraph_rl.agent import Agent, MethodLike
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, as_path, is_int, require
 from ctgraph_rl.core.device import checked_device
-from ctgraph_rl.learn.labels import policies_by_label
+from ctgraph_rl.learn.labels import task_policies
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG
 from ctgraph_rl.log.run_log import RunLog
@@ -58,10 +58,7 @@ class Trained:
 
         For an agent that labels tasks itself, it is that of the task's most frequent label.
         """
-        if hasattr(self.agent, "policy_for_label"):
-            return policies_by_label(self.agent, self.curriculum, self.log, [task])[0]
-        number = None if self.curriculum.protocol.task_id == "hidden" else self.curriculum.task_ids.get(task)
-        return self.agent.policy if number is None else self.agent.policy_for(number)
+        return task_policies(self.agent, self.curriculum, self.log, [task])[0]
 
 
 def load(

@@ -152,7 +152,7 @@ def test_a_method_of_someone_else_must_be_given(tmp_path):
     with pytest.raises(ValueError, match=r"is of the method .*, no baseline: give load\(\.\.\., make_method=\)"):
         load(tmp_path)
 
-    assert type(load(tmp_path, make_method=partial(Own, **settings)).agent.agent.method) is Own
+    assert type(load(tmp_path, make_method=partial(Own, **settings)).agent.unwrapped.method) is Own
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from baselines.detectors.seen import SUSPICION, Seen
-from baselines.methods.method import multi_task_blocks
+from baselines.methods.method import AgentWithMethod, multi_task_blocks
 from baselines.parts.networks import sequences_of, trunk_of
 from ctgraph_rl.agent import Agent, MethodLike
 from ctgraph_rl.checks import NamedValues, require
@@ -173,6 +173,11 @@ class SelfLabelledAgent(nn.Module):
     def policy(self) -> TensorDictModuleBase:
         """The agent's policy, with the weights of the label that acts."""
         return self.learner.policy
+
+    @property
+    def unwrapped(self) -> Agent:
+        """The agent without detector and method."""
+        return self.learner.agent if isinstance(self.learner, AgentWithMethod) else self.learner
 
     def policy_for(self, task: int) -> TensorDictModuleBase:
         """Return the policy for a label."""

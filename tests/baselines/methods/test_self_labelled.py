@@ -18,6 +18,7 @@ from baselines.detectors.detector import Detector
 from baselines.detectors.seen import SUSPICION, Seen, Verdict
 from baselines.methods.parts.self_labelled import SelfLabelledAgent
 from baselines.parts.networks import trunk_of
+from baselines.ppo import PPO
 from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, learn_curriculum
 from ctgraph_rl.core.rewards import Needle
 from ctgraph_rl.runs.load import load
@@ -293,6 +294,7 @@ def test_a_run_with_a_detector_says_so_in_its_name_metrics_and_directory(monkeyp
     run, trained = read_run(tmp_path / "run"), load(tmp_path / "run")
     assert run.agent == "PPO + MaskRI + Oracle"
     assert [run.metrics[name]["value"] for name in ("detection_delay", "label_agreement")] == [0, 1]
+    assert type(trained.agent.unwrapped) is PPO
     assert trained.log.training("acted_label").tolist() == [1, 1, 2, 2, 3, 3, 4, 4]
     for number, task in enumerate(trained.curriculum.tasks):
         assert equal(trained.policy_for(task).state_dict(), trained.agent.policy_for(number).state_dict())
