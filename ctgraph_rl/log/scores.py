@@ -42,7 +42,7 @@ def scores(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None
     """Every metric by name, those of `metrics.summary` first; undefined with the reason where it has no value.
 
     The lifelong metrics are on the scale of l2metrics, 1..101, with each task's known range: 1 is its ``fail_reward``,
-    101 its optimal value. Of tasks that are no CT-graphs, 1 is the lowest mean return.
+    101 its optimal value. Of tasks that are no CT-graphs, 1 is the lowest return.
 
     Args:
         log: a whole run.
@@ -236,7 +236,7 @@ def ceilings(tasks: Sequence[Task]) -> dict[str, Tensor | Undefined]:
 
 
 def lowest_returns(tasks: Sequence[TaskLike]) -> Tensor | Undefined:
-    """Each task's return of a failure, of others than CT-graphs the lowest mean return, float64 [tasks]."""
+    """Each task's return of a failure, of others than CT-graphs the lowest return, float64 [tasks]."""
     if not are_graphs(tasks):
         return _said_by(tasks, "return_bounds", lambda task: task.return_bounds[0])
     return float64([task.fail_reward for task in tasks])

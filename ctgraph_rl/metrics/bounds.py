@@ -8,13 +8,14 @@ from typing import NamedTuple
 
 
 class Known(NamedTuple):
-    """Bounds on the numbers of a run."""
+    """Bounds on the numbers of a run: of what is measured, so neither the optimum nor a mean over episodes is one."""
 
-    low: float  # lowest mean return on any task; -inf where nothing bounds it
+    low: float  # lowest return of an evaluation of any task, with the noise of rewards; -inf where nothing bounds it
     high: float  # highest one
     tasks: int
     evaluations: int  # of each task, after those before training
-    failure_is_lowest: bool  # whether no return is below that of a failure
+    lowest_share: float = -math.inf  # lowest of (return - failure) / (optimum - failure) of any task's evaluation
+    highest_share: float = math.inf  # highest one: 1 where no evaluation is better than the optimum
 
 
 LowAndHigh = tuple[float, float]
@@ -33,8 +34,13 @@ def not_negative(known: Known) -> LowAndHigh:
 
 
 def at_most_1(known: Known) -> LowAndHigh:
-    """Return the bounds of a share of what there was to gain."""
-    return -math.inf, 1.0
+    """Return the bounds of a share of what there was to gain up to the optimum."""
+    return -math.inf, 1.0 if known.highest_share <= 1 else math.inf
+
+
+def of_regret(known: Known) -> LowAndHigh:
+    """Return the bounds of what is lost against the optimum; chance may gain something, where an episode can."""
+    return 0.0 if known.highest_share <= 1 else -math.inf, math.inf
 
 
 def between(low: float, high: float) -> BoundsOf:
@@ -97,4 +103,15 @@ def of_counts(known: Known) -> LowAndHigh:
 
 def from_failure_to_best(low: float, high: float) -> BoundsOf:
     """Return the bounds of performance on a scale on which a failure is ``low`` and the optimum ``high``."""
-    return lambda known: (low if known.failure_is_lowest else -math.inf, high)
+    scale = high - low
+    return lambda known: (low + scale * known.lowest_share, low + scale * known.highest_share)
+
+
+def of_changes_on_scale(scale: float) -> BoundsOf:
+    """Return the bounds of differences of performance on such a scale, ``scale`` long from a failure to the optimum."""
+
+    def bounds(known: Known) -> LowAndHigh:
+        widest = scale * (known.highest_share - known.lowest_share)
+        return -widest, widest
+
+    return bounds

@@ -9,14 +9,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ctgraph_rl.metrics.bounds import at_most_1, not_negative, of_performance
+from ctgraph_rl.metrics.bounds import at_most_1
 from ctgraph_rl.metrics.record import HERE, Undefined, defined, ratio
 
 NO_GAP = 1e-12
 """Smallest gap between the best memoryless policy and the optimum."""
 
 
-@defined("ctgraph_rl/ceiling-open-loop", "1/T sum_j o_j", HERE, bounds=of_performance)
+@defined("ctgraph_rl/ceiling-open-loop", "1/T sum_j o_j", HERE, is_exact=True)
 def open_loop_ceiling(open_loop_ceilings: Tensor) -> Tensor:
     """Mean over tasks of the best mean return of a fixed sequence of actions, which ignores all observations.
 
@@ -26,7 +26,7 @@ def open_loop_ceiling(open_loop_ceilings: Tensor) -> Tensor:
     return open_loop_ceilings
 
 
-@defined("ctgraph_rl/ceiling-memoryless", "1/T sum_j m_j", HERE, bounds=of_performance)
+@defined("ctgraph_rl/ceiling-memoryless", "1/T sum_j m_j", HERE, is_exact=True)
 def memoryless_ceiling(memoryless_ceilings: Tensor) -> Tensor:
     """Mean over tasks of the best mean return of a policy that sees an observation and remembers nothing.
 
@@ -41,7 +41,7 @@ def memoryless_ceiling(memoryless_ceilings: Tensor) -> Tensor:
     "1/T sum_j best_j",
     HERE,
     missing="a task's optimal value is not known: its graph is too large",
-    bounds=of_performance,
+    is_exact=True,
 )
 def optimal_performance(best: Tensor) -> Tensor:
     """Mean over tasks of the best mean return of any policy, of one that knows the goal where goals change.
@@ -77,7 +77,7 @@ def memory_gap_closed(performance: Tensor, memoryless_ceilings: Tensor, best: Te
     return ratio(performance[-1] - memoryless_ceilings, torch.where(gap > NO_GAP, gap, 0.0))
 
 
-@defined("ctgraph_rl/state-entropy-random", "1/T sum_j H_j(state | observation), random", HERE, bounds=not_negative)
+@defined("ctgraph_rl/state-entropy-random", "1/T sum_j H_j(state | observation), random", HERE, is_exact=True)
 def state_entropy_random(random_entropies: Tensor) -> Tensor:
     """Mean over tasks of H(state | observation) in bits under the uniformly random policy; 0 is fully observable.
 
@@ -87,9 +87,7 @@ def state_entropy_random(random_entropies: Tensor) -> Tensor:
     return random_entropies
 
 
-@defined(
-    "ctgraph_rl/state-entropy-navigation", "1/T sum_j H_j(state | observation), navigating", HERE, bounds=not_negative
-)
+@defined("ctgraph_rl/state-entropy-navigation", "1/T sum_j H_j(state | observation), navigating", HERE, is_exact=True)
 def state_entropy_navigation(navigation_entropies: Tensor) -> Tensor:
     """The same under the policy that waits at wait states and decides at random.
 
@@ -99,7 +97,7 @@ def state_entropy_navigation(navigation_entropies: Tensor) -> Tensor:
     return navigation_entropies
 
 
-@defined("ctgraph_rl/state-entropy-optimal", "1/T sum_j H_j(state | observation), optimal", HERE, bounds=not_negative)
+@defined("ctgraph_rl/state-entropy-optimal", "1/T sum_j H_j(state | observation), optimal", HERE, is_exact=True)
 def state_entropy_optimal(optimal_entropies: Tensor) -> Tensor:
     """The same under the policy that waits at wait states and decides for the goal.
 

@@ -28,7 +28,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ctgraph_rl.metrics.bounds import between, from_failure_to_best, not_negative
+from ctgraph_rl.metrics.bounds import between, from_failure_to_best, not_negative, of_changes_on_scale
 from ctgraph_rl.metrics.record import defined, float64
 from ctgraph_rl.metrics.regimes import Regime, RegimeTable
 
@@ -140,7 +140,7 @@ def performance_recovery(regimes: Regimes) -> Tensor:
     "new2022/perf-maintenance-mrlep",
     "mean over tasks and later evaluations e of tp(e) - tp(first evaluation after the last training)",
     missing="a task has no later evaluation",
-    bounds=between(-SCALE, SCALE),
+    bounds=of_changes_on_scale(SCALE),
 )
 def maintenance_of_evaluation(regimes: Regimes) -> Tensor:
     """PM (mrlep): change of a task's evaluations against the most recent one right after its training.
@@ -154,7 +154,7 @@ def maintenance_of_evaluation(regimes: Regimes) -> Tensor:
     "new2022/perf-maintenance-mrtlp",
     "mean over tasks and later evaluations e of tp(e) - tp(last training)",
     missing="a task has no later evaluation",
-    bounds=between(-SCALE, SCALE),
+    bounds=of_changes_on_scale(SCALE),
 )
 def maintenance_of_training(regimes: Regimes) -> Tensor:
     """PM (mrtlp): as `maintenance_of_evaluation`, against the terminal performance of the most recent training."""

@@ -14,7 +14,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from ctgraph_rl.metrics.bounds import between, from_failure_to_best, not_negative
+from ctgraph_rl.metrics.bounds import between, from_failure_to_best, not_negative, of_regret
 from ctgraph_rl.metrics.record import HERE, MASTERED, defined, float64, ratio
 
 PAPER = "closed forms of Soltoggio et al. 2023 (arXiv 2302.10887)"
@@ -64,7 +64,7 @@ def stage_reached(end_rates: Tensor, success_rates: Tensor, mastered: float = MA
     HERE,
     aggregate=torch.sum,
     inputs={"best": "interval_best"},
-    bounds=not_negative,
+    bounds=of_regret,
 )
 def regret(episodes: Tensor, returns: Tensor, best: Tensor) -> Tensor:
     """Return that was lost while learning, against the optimal policy in every finished episode.

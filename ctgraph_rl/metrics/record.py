@@ -82,6 +82,8 @@ class Entry(NamedTuple):
     """The lowest and the highest value that a run can have."""
     is_time: bool = False
     """Whether it is a time, infinite in a run that never got there: where terms have no value."""
+    is_exact: bool = False
+    """Whether it follows from the curriculum alone: every run has the same value, which has no interval."""
 
     def of(self, given: Mapping[str, Any]) -> Metric:
         """Compute the metric of inputs by name; undefined where one of them is `Undefined`, for its reason."""
@@ -109,6 +111,7 @@ def defined(
     inputs: Mapping[str, str] | None = None,
     bounds: BoundsOf = unbounded,
     is_time: bool = False,
+    is_exact: bool = False,
 ) -> Callable[[Callable[Arguments, Tensor]], Callable[Arguments, Metric]]:
     """Make a metric of a function that returns the terms of its formula, NaN for a term without a value.
 
@@ -128,6 +131,7 @@ def defined(
         bounds: the lowest and the highest value, from what is known of a run; one of `ctgraph_rl.metrics.bounds`.
             Intervals over seeds stay within.
         is_time: whether it is a time, which runs that never get there have no value of.
+        is_exact: whether it follows from the curriculum alone, so that all runs have one value.
 
     Raises:
         ValueError: for a function without inputs, an argument without default that is no input or whose name is nearly
@@ -155,16 +159,15 @@ def defined(
                 return undefined(metric, str(reason))
 
         metric.definition = meaning  # type: ignore[attr-defined]
-        _register(metric, meaning, inputs or {}, bounds, is_time)
+        entry = _entry(metric, meaning, inputs or {})
+        METRICS[metric.__name__] = entry._replace(bounds=bounds, is_time=is_time, is_exact=is_exact)
         return metric
 
     return decorate
 
 
-def _register(
-    metric: Callable[..., Metric], meaning: Definition, renamed: Mapping[str, str], bounds: BoundsOf, is_time: bool
-) -> None:
-    """List a metric with the inputs of its arguments."""
+def _entry(metric: Callable[..., Metric], meaning: Definition, renamed: Mapping[str, str]) -> Entry:
+    """Return a metric with the inputs of its arguments, to be listed."""
     name = metric.__name__
     arguments = signature(metric).parameters
     inputs = {}
@@ -188,7 +191,7 @@ def _register(
         raise ValueError(f"metric {name}: no input for {', '.join(unknown)}. Inputs: {', '.join(INPUTS)}")
     if name in METRICS or meaning.id in (entry.meaning.id for entry in METRICS.values()):
         raise ValueError(f"metric {name} ({meaning.id}): another metric has its name or its id; choose others")
-    METRICS[name] = Entry(metric, meaning, inputs, required=tuple(required), bounds=bounds, is_time=is_time)
+    return Entry(metric, meaning, inputs, tuple(required))
 
 
 def undefined(metric: Callable[..., Metric], reason: str) -> Metric:

@@ -51,7 +51,7 @@ def score_of(results: Sequence[Measured]) -> Score:
     room = fmean(each.optimum - each.floor for each in results)
     ratio = fmean(each.value - each.floor for each in results) / room
     rest = [each.value - each.floor - ratio * (each.optimum - each.floor) for each in results]
-    exact = Bounds(min(-each.floor / room for each in results), 1.0, noisy=True)
+    exact = Bounds(min(-each.floor / room for each in results), 1.0)
     bounds = exact if all(each.exact for each in results) else UNBOUNDED
     found = mean([ratio + each / room for each in rest], bounds=bounds)
     value = min(max(ratio, 0.0), 1.0)

@@ -2,55 +2,65 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 
 from ctgraph_rl.log.files import CURRICULUM
+from ctgraph_rl.log.scores import lowest_returns, optimal_values
+from ctgraph_rl.metrics import Undefined
 from ctgraph_rl.metrics.bounds import Known, of_performance
 from ctgraph_rl.metrics.record import METRICS
 from ctgraph_rl.packages import curriculum_named
-from ctgraph_rl.report.intervals import UNBOUNDED, Bounds
+from ctgraph_rl.report.intervals import SCALED_DIGITS, UNBOUNDED, Bounds
+from ctgraph_rl.report.statistics import Estimate, constant, mean
 from ctgraph_rl.runs.read import Run, grouped, present
 from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.kinds.task_like import TaskLike
 from ctgraph_rl.tasks.task import are_graphs
 
-NOTHING_KNOWN = Known(UNBOUNDED.low, UNBOUNDED.high, tasks=1, evaluations=1, failure_is_lowest=False)
+NOTHING_KNOWN = Known(UNBOUNDED.low, UNBOUNDED.high, tasks=1, evaluations=1)
 
 
 @dataclass(frozen=True)
 class BoundsOfRuns:
-    """The bounds of what the runs of a curriculum measure; infinite where nothing is known.
+    """The bounds of what the runs of a curriculum measure, with the noise of rewards; infinite where nothing is known.
 
     Args:
-        returns: of each task by its label.
+        returns: of an evaluation of each task, by its label.
         known: what the metrics' bounds follow from.
-        noisy: whether rewards have noise, so that what is measured may be outside of what bounds its mean.
+        of_training: of the mean return of any number of episodes.
         one_episode: whether all episodes of an evaluation are one: greedy ones of tasks without chance.
     """
 
-    returns: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    returns: Mapping[str, Bounds] = field(default_factory=dict)
     known: Known = NOTHING_KNOWN
-    noisy: bool = False
+    of_training: Bounds = UNBOUNDED
     one_episode: bool = False
 
     @property
     def of_returns(self) -> Bounds:
-        """Of the mean return on any task."""
-        return Bounds(*of_performance(self.known), self.noisy)
+        """Of an evaluation of any task, and of their mean."""
+        return Bounds(*of_performance(self.known))
 
     def of_task(self, label: str) -> Bounds:
-        """Of the mean return on a task."""
-        return Bounds(*self.returns[label], self.noisy) if label in self.returns else UNBOUNDED
+        """Of an evaluation of a task."""
+        return self.returns.get(label, UNBOUNDED)
 
     def of_change(self, label: str) -> Bounds:
-        """Of the difference of two mean returns on a task."""
-        low, high, noisy = self.of_task(label)
-        return Bounds(low - high, high - low, noisy)
+        """Of the difference of two evaluations of a task."""
+        return self.of_task(label).of_differences()
 
     def of_metric(self, name: str) -> Bounds:
         """Of a metric; one of another version has none."""
-        return Bounds(*METRICS[name].bounds(self.known), self.noisy) if name in METRICS else UNBOUNDED
+        return Bounds(*METRICS[name].bounds(self.known)) if name in METRICS else UNBOUNDED
+
+    def estimate(self, metric: str, values: Sequence[float | None]) -> Estimate:
+        """Return a metric over seeds: its mean with the interval of its bounds, or its exact value without one."""
+        if metric in METRICS and METRICS[metric].is_exact:
+            return constant(values)
+        return mean(values, bounds=self.of_metric(metric))
 
 
 NO_BOUNDS = BoundsOfRuns()
@@ -79,33 +89,55 @@ def bounds_of(runs: Iterable[Run]) -> BoundsOfRuns:
 def bounds_of_curriculum(curriculum: Curriculum, evaluations: int = 1) -> BoundsOfRuns:
     """Return the bounds of what runs of a curriculum measure.
 
+    Each task says what an episode can return. That bounds means of episodes; what bounds the mean over all seeds, such
+    as the optimum, does not.
+
     Args:
         curriculum: what they learn.
         evaluations: of each task, after those before training; only those of sums over time need it.
     """
-    if not are_graphs(curriculum.tasks):
-        return _bounds_of_others(curriculum, evaluations)
-    returns = {label: task.return_bounds for label, task in zip(curriculum.labels, curriculum.tasks, strict=True)}
-    lows, highs = zip(*returns.values(), strict=True)
-    failure = all(task.fail_reward == task.return_bounds[0] for task in curriculum.tasks)
-    known = Known(min(lows), max(highs), len(returns), evaluations=evaluations, failure_is_lowest=failure)
-    noisy = any(task.reward_std > 0 for task in curriculum.tasks)
-    alike = curriculum.evaluation.greedy and all(task.is_deterministic for task in curriculum.tasks)
-    return BoundsOfRuns(returns, known, noisy=noisy, one_episode=alike)
-
-
-def _bounds_of_others(curriculum: Curriculum, evaluations: int) -> BoundsOfRuns:
-    """Return the bounds of tasks that are no CT-graphs; none where a task does not know its own.
-
-    They bound means, so what a few episodes of a task with chance measure may be outside.
-    """
+    evaluation = curriculum.evaluation
+    tasks = (*curriculum.tasks, *evaluation.held_out)
+    graphs = are_graphs(tasks)
+    episodes = evaluation.num_episodes
+    if evaluation.adapt_episodes > 0:
+        episodes //= evaluation.episodes_per_row  # of each place in a row
+    of_evaluation = []
+    of_episode = []
     try:
-        pairs = [task.return_bounds for task in curriculum.tasks]  # type: ignore[attr-defined]
+        for task in tasks:
+            bounds = Bounds(*task.return_bounds)  # type: ignore[attr-defined]
+            noise = task.return_noise if graphs else 0.0  # type: ignore[attr-defined]
+            of_evaluation.append(bounds.widened(noise / math.sqrt(episodes)))
+            of_episode.append(bounds.widened(noise))
     except (AttributeError, ValueError):
         return NO_BOUNDS
-    lows, highs = zip(*pairs, strict=True)
-    known = Known(min(lows), max(highs), len(pairs), evaluations=evaluations, failure_is_lowest=True)
-    return BoundsOfRuns(dict(zip(curriculum.labels, pairs, strict=True)), known, noisy=True, one_episode=False)
+    whole = _around(of_evaluation)
+    of_tasks = of_evaluation[: len(curriculum.tasks)]
+    shares = _shares(curriculum.tasks, of_tasks)
+    known = Known(*whole, len(of_tasks), evaluations, lowest_share=shares.low, highest_share=shares.high)
+    returns = dict(zip(curriculum.labels, of_tasks, strict=True))
+    alike = evaluation.greedy and are_graphs(curriculum.tasks) and all(t.is_deterministic for t in curriculum.tasks)
+    return BoundsOfRuns(returns, known, _around(of_episode), one_episode=alike)
+
+
+def _around(bounds: Sequence[Bounds]) -> Bounds:
+    return Bounds(min(each.low for each in bounds), max(each.high for each in bounds))
+
+
+def _shares(tasks: Sequence[TaskLike], returns: Sequence[Bounds]) -> Bounds:
+    """Return the bounds of (return - failure) / (optimum - failure) of any task; infinite where these are not known."""
+    failures = lowest_returns(tasks)
+    optima = optimal_values(tasks)
+    if isinstance(failures, Undefined) or isinstance(optima, Undefined):
+        return UNBOUNDED
+    shares = []
+    for bounds, failure, optimum in zip(returns, failures.tolist(), optima.tolist(), strict=True):
+        if not optimum > failure:
+            return UNBOUNDED
+        ends = [round((end - failure) / (optimum - failure), SCALED_DIGITS) for end in bounds]
+        shares.append(Bounds(*ends))
+    return _around(shares)
 
 
 def curriculum_of(run: Run) -> Curriculum | None:

@@ -13,12 +13,29 @@ import numpy as np
 
 
 class Bounds(NamedTuple):
-    """The lowest and the highest possible value, infinite where it is not known."""
+    """The lowest and the highest value that a seed can have, infinite where it is not known.
+
+    What bounds the mean over seeds, such as the optimum, bounds no seed: with it the interval would miss the mean.
+    """
 
     low: float
     high: float
-    noisy: bool = False  # whether values may be outside of what bounds their mean; they count as at the bound
 
+    def widened(self, noise: float) -> Bounds:
+        """Return the bounds of values with normal noise; all but 1 of 15,000 values at a bound are within.
+
+        Args:
+            noise: its standard deviation in a seed's value, such as ``reward_std`` over the root of the episodes.
+        """
+        return Bounds(self.low - NOISE * noise, self.high + NOISE * noise)
+
+    def of_differences(self) -> Bounds:
+        """Return the bounds of the difference of two values."""
+        return Bounds(self.low - self.high, self.high - self.low)
+
+
+NOISE = 4
+"""Standard deviations by which noise widens bounds."""
 
 UNBOUNDED = Bounds(-math.inf, math.inf)
 
@@ -42,7 +59,7 @@ def student(level: float, freedom: int) -> float:
 
 def gaffke(values: Sequence[float], bounds: Bounds, level: float) -> tuple[float, float]:
     """Return Gaffke's interval of a mean of values within bounds."""
-    low, high, _ = bounds
+    low, high = bounds
     spread = high - low
     if spread == 0:
         return low, high
@@ -85,9 +102,9 @@ def _least_mean(values: tuple[float, ...], tail: float) -> float:
 
 def within_bounds(known: Sequence[float], bounds: Bounds) -> bool:
     """Return whether values are within bounds, rounding apart."""
-    low, high, noisy = bounds
+    low, high = bounds
     slack = ROUNDING * max([1.0, *(abs(bound) for bound in (low, high) if math.isfinite(bound))])
-    return noisy or all(low - slack <= value <= high + slack for value in known)
+    return all(low - slack <= value <= high + slack for value in known)
 
 
 @cache

@@ -259,7 +259,9 @@ def _estimate(by_seed: BySeed, metric: str, bounds: BoundsOfRuns, kind: str) -> 
             never = run is not None and run.metrics.get(metric, {}).get("n_undefined")
             times.append(math.inf if never else _value(run, metric))
         return statistics.median_time(times)
-    return _over_seeds(_values(by_seed, metric), bounds.of_metric(metric), kind)
+    values = _values(by_seed, metric)
+    is_exact = metric in metrics.METRICS and metrics.METRICS[metric].is_exact
+    return statistics.constant(values) if is_exact else _over_seeds(values, bounds.of_metric(metric), kind)
 
 
 def _over_seeds(values: Sequence[float | None], bounds: statistics.LowHigh, kind: str) -> Estimate:

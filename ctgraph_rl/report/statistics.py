@@ -65,6 +65,9 @@ class Estimate:
         method: what the value and the interval are.
         reason: why value or interval are missing, or why an interval of equal seeds is wide.
         std: standard deviation over seeds, shown in place of an interval; None for other estimates.
+
+    Raises:
+        ValueError: for an interval without a value, with one end, or that its value is outside of.
     """
 
     value: float | None
@@ -75,6 +78,14 @@ class Estimate:
     method: str
     reason: str | None = None
     std: float | None = None
+
+    def __post_init__(self) -> None:
+        ends = (self.low, self.high)
+        if ends != (None, None):
+            has_all = None not in (self.value, *ends)
+            holds = has_all and self.low <= self.value <= self.high  # type: ignore[operator]
+            interval = f"[{self.low}, {self.high}]"
+            require((holds, f"an interval must have two ends around its value, got {self.value} and {interval}"))
 
     def __str__(self) -> str:
         """Value, interval and seeds, such as ``0.50 [0.25, 0.75] n = 9/10``, or ``0.50 ± 0.10 n = 10``."""
@@ -126,8 +137,8 @@ def mean(values: Values, level: float = LEVEL, bounds: LowHigh = UNBOUNDED) -> E
     Args:
         values: one per seed; None or NaN for a seed without.
         level: coverage of the interval.
-        bounds: the lowest and the highest possible value. A value outside makes them none, unless they are noisy
-            `Bounds`.
+        bounds: the lowest and the highest value that a seed can have, see `Bounds`; noise widens them. A value outside
+            makes them none.
     """
     require(*fraction(level=level))
     known, missing = _known(values)
@@ -145,16 +156,26 @@ def mean(values: Values, level: float = LEVEL, bounds: LowHigh = UNBOUNDED) -> E
         reason = "one seed has no interval"
     elif bounded:
         low, high = gaffke(known, limits, level)
+        low = min(low, centre)
+        high = max(high, centre)
         if min(known) == max(known) and limits.low < limits.high:
             reason = EQUAL_SEEDS
     elif min(known) == max(known):
         reason = "all seeds are equal: no spread to estimate"
     else:
         half = float(student(level, len(known) - 1) * np.std(known, ddof=1) / math.sqrt(len(known)))
-        lowest, highest, _ = limits if within else UNBOUNDED
-        low = max(lowest, centre - half)
-        high = min(highest, centre + half)
+        lowest, highest = limits if within else UNBOUNDED
+        low = min(max(lowest, centre - half), centre)
+        high = max(min(highest, centre + half), centre)
     return Estimate(centre, low=low, high=high, n=len(known), n_undefined=missing, method=method, reason=reason)
+
+
+def constant(values: Values) -> Estimate:
+    """Return a number that follows from the curriculum alone, so that all seeds have it: exact, without an interval."""
+    known, missing = _known(values)
+    if not known:
+        return _nothing(missing, "exact")
+    return Estimate(fmean(known), None, None, len(known), missing, method="exact")
 
 
 @takes_numbers
@@ -212,7 +233,8 @@ def iqm(values: Sequence[Values], level: float = LEVEL, resamples: int = RESAMPL
         method="percentile",
         random_state=np.random.default_rng(seed),
     )
-    low, high = map(float, found.confidence_interval)
+    low = min(value, float(found.confidence_interval.low))
+    high = max(value, float(found.confidence_interval.high))
     reason = "the bootstrap samples are equal: no spread to estimate" if low == high else None
     return Estimate(value, low=low, high=high, n=n, n_undefined=undefined, method=method, reason=reason)
 
@@ -289,7 +311,7 @@ def interquartile_mean(
         bounds: the lowest and the highest possible value.
     """
     known, n, undefined = _of_tasks(values, "interquartile_mean", level, resamples)
-    lowest, highest, _ = _checked(bounds)
+    lowest, highest = _checked(bounds)
     method = f"IQM, stratified bootstrap {level:.0%}"
     if n < LEAST_FOR_BOOTSTRAP:
         reason = f"needs {LEAST_FOR_BOOTSTRAP} seeds of each task, got {n}"
@@ -330,8 +352,7 @@ def compare(first: Values, second: Values, level: float = LEVEL, bounds: LowHigh
     signs = [(each > 0) - (each < 0) for each in known]
     std = float(np.std(known, ddof=1)) if len(known) > 1 else None
     p_value = _sign_flip(known) if len(known) > 1 else None
-    low, high, noisy = _checked(bounds)
-    difference = mean(differences, level, Bounds(low - high, high - low, noisy))
+    difference = mean(differences, level, _checked(bounds).of_differences())
     return Comparison(difference, std, p_value, wins=signs.count(1), ties=signs.count(0), losses=signs.count(-1))
 
 

@@ -281,8 +281,13 @@ class Task:
 
     @property
     def return_bounds(self) -> tuple[float, float]:
-        """The lowest and the highest mean return of any policy; see `values.return_bounds`."""
+        """The lowest and the highest return of an episode without the noise of rewards; see `values.return_bounds`."""
         return values.return_bounds(self)
+
+    @property
+    def return_noise(self) -> float:
+        """The largest standard deviation that this noise gives to an episode's return; see `values.return_noise`."""
+        return values.return_noise(self)
 
     @property
     def is_deterministic(self) -> bool:

@@ -156,10 +156,10 @@ def memoryless_ceiling(task: Task, deterministic: bool = False) -> float:
 
 
 def return_bounds(task: Task) -> tuple[float, float]:
-    """Return the lowest and the highest mean return of any policy, undiscounted; infinite where nothing bounds it.
+    """Return the lowest and the highest return of an episode, undiscounted; infinite where nothing bounds it.
 
     An end state pays ``goal_reward`` times a share within the reward's ``bounds``, and the fail state ``fail_reward``.
-    The noise of rewards has mean 0 and changes nothing. The sum of a ``step_reward`` is not bounded, as an agent may
+    The noise of rewards is left out, see `return_noise`. The sum of a ``step_reward`` is not bounded, as an agent may
     wait on.
     """
     bounds = getattr(task.reward_fn, "bounds", None)
@@ -168,6 +168,18 @@ def return_bounds(task: Task) -> tuple[float, float]:
     paid = [*(share * task.goal_reward for share in bounds(task.graph.branching_factor)), task.fail_reward]
     low = min(paid) if task.step_reward >= 0 else -math.inf
     return low, max(paid) if task.step_reward <= 0 else math.inf
+
+
+def return_noise(task: Task) -> float:
+    """Return the largest standard deviation that the noise of rewards gives to the return of an episode.
+
+    One end state pays in an episode: ``reward_std``, times the size of what is paid where noise is multiplicative.
+    """
+    if task.reward_std == 0 or task.reward_noise == "additive":
+        return task.reward_std
+    bounds = getattr(task.reward_fn, "bounds", None)
+    shares = (-math.inf, math.inf) if bounds is None else bounds(task.graph.branching_factor)
+    return task.reward_std * max(abs(share * task.goal_reward) for share in shares)
 
 
 def open_loop_ceiling(task: Task) -> float:

@@ -10,6 +10,7 @@ from results_of import PAGE, Line, raw
 from studies.raw import mean_of, numbers_in
 
 from ctgraph_rl import Curriculum
+from ctgraph_rl.report.bounds_of_runs import bounds_of_curriculum
 from ctgraph_rl.report.intervals import Bounds
 from ctgraph_rl.report.style import agent_style, frames_axis, style
 from ctgraph_rl.visualize.style import new_figure, save_figure
@@ -71,7 +72,8 @@ def sentence_of(curriculum: Curriculum) -> str:
     if not of:
         return ""
     (agent, _), first_lines = next(iter(of.items()))
-    parts = [_reached(method, lines) for (_, method), lines in of.items()]
+    bounds = bounds_of_curriculum(curriculum).of_returns
+    parts = [_reached(method, lines, bounds) for (_, method), lines in of.items()]
     return (
         f"`agent={agent}`, {_frames(curriculum, first_lines[0])}. Mean return over all tasks at the end: "
         f"{'; '.join(parts)}.{_known(first_lines[0])} Raw: `{NAME}.csv`."
@@ -85,10 +87,9 @@ def _frames(curriculum: Curriculum, line: Line) -> str:
     return f"{ran:,} {what}" if ran == full else f"{ran:,} instead of {full:,} {what}"
 
 
-def _reached(method: str, lines: list[Line]) -> str:
+def _reached(method: str, lines: list[Line], bounds: Bounds) -> str:
     """Return the mean return at the end with its interval, and right after each task's own block."""
     first = lines[0]
-    bounds = Bounds(float(first["lowest"] or "-inf"), float(first["highest"] or "inf"), noisy=True)
     ids = IDS[first["task_id"]]
     seeds = f"{len(lines)} seed{'s' * (len(lines) > 1)}"
     number = mean_of(numbers_in(lines, "end"), bounds)

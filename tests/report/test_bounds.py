@@ -11,18 +11,18 @@ from helpers.made_runs import all_runs, line, write_run
 from torch import Tensor
 
 import curricula
-from ctgraph_rl import metrics
+from ctgraph_rl import Block, Curriculum, metrics
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import Arrival, Gradient, ReferenceLinear
 from ctgraph_rl.metrics.bounds import Known
 from ctgraph_rl.metrics.record import METRICS
 from ctgraph_rl.report import page
-from ctgraph_rl.report.bounds_of_runs import bounds_of
+from ctgraph_rl.report.bounds_of_runs import bounds_of, bounds_of_curriculum
 from ctgraph_rl.report.intervals import UNBOUNDED, Bounds
 from ctgraph_rl.report.results import comparisons, table
 from ctgraph_rl.report.sections import sections
-from ctgraph_rl.report.statistics import mean
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_su_b1
+from ctgraph_rl.tasks.kinds.gym_task import GymTask
 
 pytest.importorskip("scipy")
 NEEDLE = ct_su_b1()
@@ -67,7 +67,7 @@ def test_no_end_state_pays_more_or_less_than_the_reward_says(reward_fn, branchin
 @pytest.mark.parametrize(("low", "high"), [pytest.param(0.0, 1.0, marks=pytest.mark.slow), (-1.0, 2.0)])
 def test_no_metric_of_any_matrix_or_curve_is_outside_of_what_it_says(low, high):
     generator = torch.Generator().manual_seed(0)
-    known = Known(low, high, tasks=3, evaluations=6, failure_is_lowest=True)
+    known = Known(low, high, tasks=3, evaluations=6, lowest_share=0.0, highest_share=1.0)
     extremes = 0
     for _ in range(60):
         values = torch.rand(7, 3, generator=generator, dtype=torch.float64)
@@ -174,8 +174,57 @@ def test_p_values_of_comparisons_are_corrected_for_all_pairs(tmp_path):
     }
 
 
-def test_noise_of_rewards_puts_what_is_measured_outside_and_no_interval():
-    noisy, exact = (mean([1.01, 0.99, 1.0], bounds=bounds) for bounds in (Bounds(0, 1, noisy=True), (0, 1)))
+def test_noise_widens_what_a_seed_can_have_by_four_standard_deviations_of_its_mean():
+    curriculum = curricula.load("fo_b1_noisy")  # reward_std 0.5, 100 episodes in an evaluation
+    bounds = bounds_of_curriculum(curriculum)
 
-    assert str(noisy) == "1.00 [0.29, 1.00] n = 3"
-    assert exact.reason == "a value is outside [0, 1]"
+    assert bounds.of_returns == bounds.of_task(curriculum.labels[0]) == pytest.approx((-0.2, 1.2))
+    assert bounds.of_change(curriculum.labels[0]) == pytest.approx((-1.4, 1.4))
+    assert bounds.of_training == (-2, 3)  # a mean of one episode
+    assert bounds.of_metric("normalised_performance") == pytest.approx((-0.2, 1.2))
+    assert bounds.of_metric("regret") == UNBOUNDED
+    assert bounds.of_metric("remembering")[1] == 1
+
+
+def test_adaptation_measures_fewer_episodes_so_that_its_noise_is_larger():
+    curriculum = curricula.load("fo_b1_noisy")
+    evaluation = replace(curriculum.evaluation, num_episodes=100, episodes_per_row=4, adapt_episodes=1)
+
+    assert bounds_of_curriculum(replace(curriculum, evaluation=evaluation)).of_returns == pytest.approx((-0.4, 1.4))
+
+
+@pytest.mark.parametrize(
+    ("changes", "noise"),
+    [
+        ({}, 0.0),
+        ({"reward_std": 0.5}, 0.5),
+        ({"reward_std": 0.5, "reward_noise": "multiplicative", "goal_reward": -3.0}, 1.5),
+        ({"reward_std": 0.5, "reward_noise": "multiplicative", "reward_fn": Own()}, math.inf),
+    ],
+)
+def test_the_noise_of_a_return_is_that_of_the_one_end_state_that_pays(changes, noise):
+    assert replace(NEEDLE, **changes).return_noise == noise
+
+
+def test_an_episode_bounds_a_sample_and_the_optimum_does_not():
+    slippery = GymTask("FrozenLake-v1", max_episode_steps=20)
+    known = bounds_of_curriculum(Curriculum("lake", 1, "-", (Block((slippery,), 64),)))
+
+    assert slippery.optimal_value(1.0) < 0.5
+    assert known.of_returns == slippery.return_bounds == (0, 1)
+    assert known.of_metric("normalised_performance") == pytest.approx((0, 1 / slippery.optimal_value(1.0)))
+    assert known.of_metric("memory_gap_closed") == known.of_metric("regret") == UNBOUNDED
+    assert bounds_of_curriculum(curricula.load("ct8")).of_metric("memory_gap_closed") == (-math.inf, 1)
+
+
+def test_what_follows_from_the_curriculum_alone_has_no_interval(tmp_path):
+    runs = of_known_curriculum(tmp_path, (1.0, 1.0, 1.0))
+    for run in runs:
+        run.metrics["optimal_performance"] = {"value": 1.0, "definition": "ctgraph_rl/ceiling-optimal"}
+
+    estimate = line(table(runs), "optimal_performance").estimate
+
+    assert str(estimate) == "1.00 n = 3" and estimate.method == "exact"
+    exact = [name for name, entry in METRICS.items() if entry.is_exact]
+    entropies = [f"state_entropy_{policy}" for policy in ("random", "navigation", "optimal")]
+    assert sorted(exact) == sorted(["open_loop_ceiling", "memoryless_ceiling", "optimal_performance", *entropies])

@@ -11,7 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctgraph_rl.report import statistics
+from ctgraph_rl.report.intervals import Bounds
 from ctgraph_rl.report.statistics import (
+    Estimate,
     compare,
     holm,
     interquartile_mean,
@@ -130,7 +132,7 @@ def test_an_interval_in_bounds_is_never_outside_nor_empty_and_grows_with_its_lev
 
     assert -1 <= wide.low <= narrow.low <= narrow.high <= wide.high <= 2
     assert narrow.low < narrow.high
-    assert narrow.low - 1e-9 <= narrow.value <= narrow.high + 1e-9 or min(one, other) < 0.5
+    assert narrow.low <= narrow.value <= narrow.high and wide.low <= wide.value <= wide.high
 
 
 @pytest.mark.parametrize(
@@ -149,6 +151,21 @@ def test_bounds_that_a_value_leaves_are_none():
 
     assert (estimate.method, estimate.reason) == ("mean, Student t 95%", "a value is outside [0, 1]")
     assert estimate.low == mean([0.5, 1.5, 1.0]).low
+
+
+def test_noise_puts_the_bounds_further_out_and_values_stay_as_they_are():
+    found = mean([1.01, 0.99, 1.0], bounds=Bounds(0, 1).widened(0.01))
+    clipped = mean([1.0, 0.99, 1.0], bounds=(0, 1))
+
+    assert found.value == pytest.approx(1.0) and found.method == "mean, Gaffke 95%"
+    assert found.low == pytest.approx(-0.04 + 1.08 * mean([1.05 / 1.08, 1.03 / 1.08, 1.04 / 1.08], bounds=(0, 1)).low)
+    assert clipped.high < 1 < found.high < 1.04
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.6, 0.9), (0.1, 0.4), (None, 0.9), (0.1, None), (math.nan, 0.9)])
+def test_an_estimate_outside_of_its_interval_cannot_be_built(low, high):
+    with pytest.raises(ValueError, match=r"an interval must have two ends around its value, got 0.5"):
+        Estimate(0.5, low, high, 5, 0, method="-")
 
 
 @pytest.mark.parametrize(

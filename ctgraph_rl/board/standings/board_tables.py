@@ -111,7 +111,7 @@ def _table(entries: Sequence[BoardEntry]) -> BoardTable:
 def _estimates(entry: BoardEntry) -> dict[str, Estimate]:
     """Return each measure of an entry over seeds, with the interval that the package's rules give it."""
     bounds = bounds_of_curriculum(entry.variant.curriculum)
-    return {name: statistics.mean(values, bounds=bounds.of_metric(name)) for name, values in entry.values.items()}
+    return {name: bounds.estimate(name, values) for name, values in entry.values.items()}
 
 
 def _pairs(lines: Sequence[Standing]) -> dict[tuple[str, str], Comparison]:

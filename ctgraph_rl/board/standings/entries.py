@@ -203,9 +203,9 @@ def _value(submission: Submission, run: str | None, metric: str, bounds: Bounds)
     if not cell:
         return None
     value = float(cell) if NUMBER.fullmatch(cell) else math.nan
-    low, high, noisy = bounds
+    low, high = bounds
     fits = math.isfinite(value) and within_bounds([value], bounds)
-    wanted = "a finite number" + ("" if noisy else f" in [{low:g}, {high:g}]")
+    wanted = f"a finite number in [{low:g}, {high:g}]"
     require((fits, f"{METRICS}: {metric} of {run} must be {wanted}, got {cell!r:.80}; verify the submission"))
     return value
 

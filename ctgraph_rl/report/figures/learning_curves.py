@@ -143,7 +143,7 @@ def _training(result: Result, blocks: Sequence[tuple[int, tuple[int, int]]], pla
     """Return the curve of each block."""
     curves = []
     for block, (start, end) in blocks:
-        bounds = result.bounds.of_returns
+        bounds = result.bounds.of_training
         curves.append(training_curve(result.finished, block, start=start, end=end, places=places, bounds=bounds))
     return curves
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -36,8 +36,8 @@ class GymTask:
         wrappers: wrap the environment one after the other: classes, or functions of an environment, by ``module:name``.
         max_episode_steps: the time limit, which truncates an episode; None: that of the id.
         label: short name in tables; None: the id with its arguments.
-        return_range: the lowest and the highest mean return of any policy, where you know them; the optimum is the
-            highest. None: computed within the time limit for environments of `WITH_TABLE`, and else unknown.
+        return_range: the lowest and the highest return of an episode, where you know them and the best policy always
+            gets the highest. None: computed within the time limit for environments of `WITH_TABLE`, and else unknown.
         repeats: whether an episode repeats with its seed and actions. If not, a stopped run resumes from its last
             announced block.
 
@@ -72,7 +72,7 @@ class GymTask:
             (names, f"wrappers must be classes or functions, or names such as my_module:MyWrapper, got {wrappers!r}"),
             (limit is None or is_int(limit, 1), f"max_episode_steps must be an integer >= 1, got {limit!r}"),
             (self.label is None or isinstance(self.label, str), f"label must be a text, got {self.label!r}"),
-            (pair is None or in_order, f"return_range must be the lowest and the highest mean return, got {pair!r}"),
+            (pair is None or in_order, f"return_range must be the lowest and the highest return, got {pair!r}"),
             *true_or_false(repeats=self.repeats),
         )
 
@@ -153,18 +153,18 @@ class GymTask:
         """
         if self.return_range is not None and gamma == 1:
             return self.return_range[1]
-        return _extreme_value(self, gamma, np.max)
+        return _best_mean_return(self, gamma)
 
     @property
     def return_bounds(self) -> tuple[float, float]:
-        """The lowest and the highest mean return of any policy.
+        """The lowest and the highest return of an episode, which chance can make better than the best mean return.
 
         Raises:
             ValueError: where they are not known.
         """
         if self.return_range is not None:
             return self.return_range
-        return _extreme_value(self, 1.0, np.min), _extreme_value(self, 1.0, np.max)
+        return _extreme_return(self, np.nanmin), _extreme_return(self, np.nanmax)
 
 
 @cache
@@ -192,29 +192,58 @@ def _is_shown(space: Any) -> bool:
     return len(space.shape) == 1 or (len(space.shape) in (2, 3) and space.dtype == np.uint8)
 
 
-@cache
-def _extreme_value(task: GymTask, gamma: float, choose: Callable[..., Any]) -> float:
-    """Return the best or the worst mean return within the time limit, by finite-horizon dynamic programming.
+class _Table(NamedTuple):
+    """Transitions of an environment of `WITH_TABLE`: arrays [states, actions, outcomes], padded with probability 0."""
 
-    V_0 = 0 and V_t(s) = choose_a sum_o p_o (r_o + gamma V_{t-1}(s_o)), without the last term where o ends the episode.
-    """
+    probs: np.ndarray
+    following: np.ndarray  # int64: states
+    rewards: np.ndarray
+    ends: np.ndarray  # 1 where the outcome ends the episode
+    initial: np.ndarray  # [states]: probability of each state at the start
+    limit: int  # steps of an episode
+
+
+@cache
+def _table(task: GymTask) -> _Table:
     env = task.make()
-    table = env.unwrapped
-    known = type(table).__module__ in WITH_TABLE and not task.wrappers
+    inner = env.unwrapped
+    known = type(inner).__module__ in WITH_TABLE and not task.wrappers
     fix = "give return_range where you know it"
     require((known, f"the best mean return of {task.id} is not known, it has no table of transitions: {fix}"))
-    transitions = table.P  # type: ignore[attr-defined]
+    transitions = inner.P  # type: ignore[attr-defined]
     most = max(len(outcomes) for of_state in transitions.values() for outcomes in of_state.values())
     padded = np.zeros((len(transitions), len(transitions[0]), most, 4))
     for state, of_state in transitions.items():
         for action, outcomes in of_state.items():
             padded[state, action, : len(outcomes)] = outcomes
     probs, following, rewards, ends = np.moveaxis(padded, -1, 0)
-    values = np.zeros(len(transitions))
-    for _ in range(env.spec.max_episode_steps):  # type: ignore[union-attr,arg-type]
-        after = rewards + gamma * (1 - ends) * values[following.astype(np.int64)]
-        values = choose((probs * after).sum(-1), axis=1)
-    return float(values @ np.asarray(table.initial_state_distrib))  # type: ignore[attr-defined]
+    initial = np.asarray(inner.initial_state_distrib)  # type: ignore[attr-defined]
+    limit = env.spec.max_episode_steps  # type: ignore[union-attr]
+    return _Table(probs, following.astype(np.int64), rewards, ends, initial, limit)  # type: ignore[arg-type]
+
+
+def _best_mean_return(task: GymTask, gamma: float) -> float:
+    """Return the best mean return within the time limit, by finite-horizon dynamic programming.
+
+    V_0 = 0 and V_t(s) = max_a sum_o p_o (r_o + gamma V_{t-1}(s_o)), without the last term where o ends the episode.
+    """
+    table = _table(task)
+    values = np.zeros(len(table.initial))
+    for _ in range(table.limit):
+        after = table.rewards + gamma * (1 - table.ends) * values[table.following]
+        values = (table.probs * after).sum(-1).max(1)
+    return float(values @ table.initial)
+
+
+def _extreme_return(task: GymTask, choose: Callable[..., Any]) -> float:
+    """Return the best or the worst return that an episode can have: as above, with any outcome that is possible."""
+    table = _table(task)
+    impossible = table.probs == 0
+    values = np.zeros(len(table.initial))
+    for _ in range(table.limit):
+        after = table.rewards + (1 - table.ends) * values[table.following]
+        values = choose(np.where(impossible, np.nan, after), axis=(1, 2))
+    return float(choose(values[table.initial > 0]))
 
 
 def _frozen_kwargs(kwargs: Any) -> tuple[tuple[str, Any], ...]:

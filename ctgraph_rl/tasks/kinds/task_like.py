@@ -18,9 +18,8 @@ class TaskLike(Hashable, Protocol):
 
     Further members are optional. ``resumes`` says that the environment can be saved: a new one continues with the same
     bits after ``load_state_dict(state_dict())``. Without it a stopped run resumes from its last announced block.
-    ``optimal_value(gamma)``, the best mean return, and ``return_bounds``,
-    the lowest and the highest one, serve metrics and figures. They raise a ``ValueError`` with the reason where
-    they are not known.
+    ``optimal_value(gamma)``, the best mean return, and ``return_bounds``, the lowest and the highest return of an
+    episode, serve metrics and figures. They raise a ``ValueError`` with the reason where they are not known.
     """
 
     @property

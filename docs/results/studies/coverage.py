@@ -15,7 +15,7 @@ from zlib import crc32
 import numpy as np
 
 from ctgraph_rl.report import statistics
-from ctgraph_rl.report.intervals import scipy
+from ctgraph_rl.report.intervals import Bounds, scipy, student
 from studies.lifelong.comparison import forward_transfer
 from studies.raw import HERE, TEMPLATES, table
 from studies.two_groups import two_groups
@@ -25,6 +25,22 @@ SEEDS = (3, 5, 10, 20)
 DRAWS = 2000
 RATE = 0.9
 TAIL = (1 - statistics.LEVEL) / 2
+
+MORE_SEEDS = (*SEEDS, 50)
+NOISES = (0.01, 0.1, 0.5, 2.0)
+"""Standard deviations of the noise in a seed's return."""
+
+NOISY_DRAWS = 20_000
+WIDTHS = 100
+KINDS = {
+    "equal, mean 1": (1.0, 1.0),
+    "equal, mean 0.98": (0.98, 1.0),
+    "equal, mean 0.5": (0.5, 1.0),
+    "solve at 0.98": (1.0, 0.98),
+    "solve at 0.9": (1.0, 0.9),
+    "solve at 0.5": (1.0, 0.5),
+}
+"""Seeds with noise: the return of a seed that solves its task, and how many do; the others have 0."""
 
 Interval = tuple[float, float]
 Rule = Callable[[Sequence[float]], Interval]
@@ -98,6 +114,80 @@ def of_means() -> str:
     """Coverage and width of each rule for a mean, of each shape and number of seeds."""
     rows = [[shape, rule, *(cell(rule, shape, n) for n in SEEDS)] for shape in SHAPES for rule in RULES]
     return table(["returns", "interval", *(f"n = {n}" for n in SEEDS)], rows)
+
+
+def of_noise() -> str:
+    """Coverage and mean width of the rule for returns with noise, of each kind of seeds, noise and number of seeds."""
+    rows = []
+    for kind in KINDS:
+        for noise in NOISES:
+            rows.append([kind, f"{noise:g}", *(noisy_cell(kind, noise, n) for n in MORE_SEEDS)])
+    return table(["seeds", "noise", *(f"n = {n}" for n in MORE_SEEDS)], rows)
+
+
+def noisy_cell(kind: str, noise: float, n: int, draws: int = NOISY_DRAWS) -> str:
+    """The coverage for returns with noise, and the mean width of the first `WIDTHS` intervals."""
+    samples, centre = noisy_returns(kind, noise, n, draws)
+    bounds = Bounds(0.0, 1.0).widened(noise)
+    found = [statistics.mean(sample, bounds=bounds) for sample in samples[:WIDTHS].tolist()]
+    width = np.mean([each.high - each.low for each in found])  # type: ignore[operator]
+    return f"{are_covered(samples, centre, bounds).mean():.1%}, {width:.2f}".replace("%", " %")
+
+
+def noisy_returns(kind: str, noise: float, n: int, draws: int) -> tuple[np.ndarray, float]:
+    """Return samples of n seeds, float64 [draws, n], each a return in [0, 1] and noise, and the true mean."""
+    centre, share = KINDS[kind]
+    rng = _rng(kind, noise, n)
+    solved = rng.random((draws, n)) < share
+    returns = np.where(solved, centre, 0.0)
+    return returns + noise * rng.standard_normal((draws, n)), centre * share
+
+
+def are_covered(samples: np.ndarray, centre: float, bounds: Bounds) -> np.ndarray:
+    """Return whether the interval of `statistics.mean` holds a number, for each sample, bool [draws].
+
+    Gaffke's lower end is below the number where the mean of random weights is so with probability `TAIL` at least. That
+    needs no quantile, so that all samples are computed at once.
+
+    Args:
+        samples: float64 [draws, n].
+        centre: the number.
+        bounds: of the values.
+    """
+    draws, n = samples.shape
+    low = np.column_stack([np.full(draws, bounds.low), np.sort(samples)])
+    high = np.column_stack([np.full(draws, -bounds.high), np.sort(-samples)])
+    covers = (_share_below(low, centre) >= TAIL) & (_share_below(high, -centre) >= TAIL)
+    spread = samples.std(axis=1, ddof=1) / math.sqrt(n)
+    half = student(statistics.LEVEL, n - 1) * spread
+    students = np.abs(samples.mean(axis=1) - centre) <= half
+    within = (samples >= bounds.low).all(axis=1) & (samples <= bounds.high).all(axis=1)
+    return np.where(within, covers, students)
+
+
+def _share_below(points: np.ndarray, limit: float) -> np.ndarray:
+    """Return the probability that a mean of points, with uniform weights that sum to 1, is at most a limit.
+
+    With points u >= 0 above the limit and v < 0 below it, by their distances, F of h and k of them is
+    (|v_k| F(h - 1, k) + u_h F(h, k - 1)) / (u_h + |v_k|), 1 without points above and 0 without points below (Ali 1973).
+
+    Args:
+        points: float64 [draws, points], rising.
+        limit: the limit.
+    """
+    distances = (points - limit).T
+    number = len(distances)
+    found = np.ones((number + 1, points.shape[0]))
+    for above in distances[::-1]:
+        is_above = above >= 0
+        found[0] = np.where(is_above, 0.0, found[0])
+        for k in range(1, number + 1):
+            below = -distances[k - 1]
+            both = is_above & (below > 0)
+            total = np.where(both, above + below, 1.0)
+            found[k] = np.where(both, (below * found[k] + above * found[k - 1]) / total, found[k])
+    count = (distances < 0).sum(axis=0)
+    return found[count, np.arange(points.shape[0])]
 
 
 def of_times(n: int) -> str:
@@ -174,7 +264,11 @@ def of_others() -> str:
 def page() -> str:
     """The page: its template with its tables."""
     template = Template((TEMPLATES / "statistics.md").read_text(encoding="utf-8"))
-    return template.substitute(of_means=of_means(), of_others=of_others(), draws=f"{DRAWS:,}")
+    return template.substitute(of_means=of_means(), of_noise=of_noise(), of_others=of_others(), **_counts())
+
+
+def _counts() -> dict[str, str]:
+    return {"draws": f"{DRAWS:,}", "noisy_draws": f"{NOISY_DRAWS:,}"}
 
 
 def make() -> None:

@@ -59,7 +59,7 @@ def both_ways(lines: Raw, configuration: str, goal: str) -> str:
     if not lines:
         return ""
     task, found = task_of(configuration, goal), []
-    bounds = Bounds(*task.return_bounds, noisy=task.reward_std > 0)
+    bounds = Bounds(*task.return_bounds).widened(task.return_noise / math.sqrt(EPISODES))
     for way in ("greedy", "sampled"):
         found.append(cell(lines, f"{way}_return", bounds) + evaluation_error(lines, f"{way}_success", task))
     return ", ".join(found)

@@ -123,7 +123,7 @@ def bounds(column: str, lines: Raw) -> tuple[float, float]:
     """The lowest and the highest value of a column."""
     run = curves(lines)
     evaluations, tasks = run.performance.shape
-    known = Known(*RETURNS, tasks=tasks, evaluations=evaluations, failure_is_lowest=True)
+    known = Known(*RETURNS, tasks=tasks, evaluations=evaluations, lowest_share=0.0, highest_share=1.0)
     return METRICS[OF_A_RUN[column]].bounds(known)
 
 
