@@ -83,7 +83,7 @@ class Entry(NamedTuple):
     is_time: bool = False
     """Whether it is a time, infinite in a run that never got there: where terms have no value."""
     is_exact: bool = False
-    """Whether it follows from the curriculum alone: every run has the same value, which has no interval."""
+    """Whether it follows from the curriculum: every run has the same value, which has no interval."""
 
     def of(self, given: Mapping[str, Any]) -> Metric:
         """Compute the metric of inputs by name; undefined where one of them is `Undefined`, for its reason."""
@@ -131,7 +131,7 @@ def defined(
         bounds: the lowest and the highest value, from what is known of a run; one of `ctgraph_rl.metrics.bounds`.
             Intervals over seeds stay within.
         is_time: whether it is a time, which runs that never get there have no value of.
-        is_exact: whether it follows from the curriculum alone, so that all runs have one value.
+        is_exact: whether it follows from the curriculum, so that all runs have one value.
 
     Raises:
         ValueError: for a function without inputs, an argument without default that is no input or whose name is nearly

@@ -171,7 +171,7 @@ def mean(values: Values, level: float = LEVEL, bounds: LowHigh = UNBOUNDED) -> E
 
 
 def constant(values: Values) -> Estimate:
-    """Return a number that follows from the curriculum alone, so that all seeds have it: exact, without an interval."""
+    """Return a number that follows from the curriculum, so that all seeds have it: exact, without an interval."""
     known, missing = _known(values)
     if not known:
         return _nothing(missing, "exact")

@@ -217,7 +217,7 @@ def test_an_episode_bounds_a_sample_and_the_optimum_does_not():
     assert bounds_of_curriculum(curricula.load("ct8")).of_metric("memory_gap_closed") == (-math.inf, 1)
 
 
-def test_what_follows_from_the_curriculum_alone_has_no_interval(tmp_path):
+def test_what_follows_from_the_curriculum_has_no_interval(tmp_path):
     runs = of_known_curriculum(tmp_path, (1.0, 1.0, 1.0))
     for run in runs:
         run.metrics["optimal_performance"] = {"value": 1.0, "definition": "ctgraph_rl/ceiling-optimal"}

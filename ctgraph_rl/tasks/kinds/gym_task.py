@@ -219,7 +219,8 @@ def _table(task: GymTask) -> _Table:
     probs, following, rewards, ends = np.moveaxis(padded, -1, 0)
     initial = np.asarray(inner.initial_state_distrib)  # type: ignore[attr-defined]
     limit = env.spec.max_episode_steps  # type: ignore[union-attr]
-    return _Table(probs, following.astype(np.int64), rewards, ends, initial, limit)  # type: ignore[arg-type]
+    following = following.astype(np.int64)
+    return _Table(probs, following, rewards, ends, initial=initial, limit=limit)  # type: ignore[arg-type]
 
 
 def _best_mean_return(task: GymTask, gamma: float) -> float:

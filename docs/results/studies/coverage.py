@@ -14,8 +14,8 @@ from zlib import crc32
 
 import numpy as np
 
-from ctgraph_rl.report import statistics
-from ctgraph_rl.report.intervals import Bounds, scipy, student
+from ctgraph_rl.report import intervals, statistics
+from ctgraph_rl.report.intervals import Bounds, scipy
 from studies.lifelong.comparison import forward_transfer
 from studies.raw import HERE, TEMPLATES, table
 from studies.two_groups import two_groups
@@ -159,7 +159,7 @@ def are_covered(samples: np.ndarray, centre: float, bounds: Bounds) -> np.ndarra
     high = np.column_stack([np.full(draws, -bounds.high), np.sort(-samples)])
     covers = (_share_below(low, centre) >= TAIL) & (_share_below(high, -centre) >= TAIL)
     spread = samples.std(axis=1, ddof=1) / math.sqrt(n)
-    half = student(statistics.LEVEL, n - 1) * spread
+    half = intervals.student(statistics.LEVEL, n - 1) * spread
     students = np.abs(samples.mean(axis=1) - centre) <= half
     within = (samples >= bounds.low).all(axis=1) & (samples <= bounds.high).all(axis=1)
     return np.where(within, covers, students)
