@@ -1,7 +1,7 @@
 """DQN: double Q-learning with replay and epsilon-greedy exploration; without memory.
 
-Mnih et al. 2015 and van Hasselt et al. 2016 (arXiv 1509.06461) on TorchRL's `QValueActor`, `EGreedyModule`,
-`DQNLoss` and replay buffer; with priorities as Schaul et al. 2016 (arXiv 1511.05952) where configured.
+Mnih et al. 2015 and van Hasselt et al. 2016 (arXiv 1509.06461) on TorchRL's `QValueActor`, `EGreedyModule` and replay
+buffer; with priorities as Schaul et al. 2016 (arXiv 1511.05952) where configured.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 from torchrl.modules import QValueActor
-from torchrl.objectives import DQNLoss
 
 from baselines.cells.cell import linear_layer
 from baselines.parts.networks import Data, TensorsByName, num_actions_of, require_weights
@@ -80,9 +79,9 @@ class DQN(QLearner):
         )
         values = TensorDictModule(head, in_keys=["features"], out_keys=["action_value"])
         features = make_encoder(observation_spec, hidden_size, kind=encoder)
-        self.greedy = QValueActor(TensorDictSequential(features, values), in_keys=features.in_keys, spec=action_spec)
-        self.dqn = DQNLoss(self.greedy, delay_value=True, double_dqn=double, action_space=action_spec)
-        self.set_networks(self.greedy, self.dqn, action_spec, learning_rate)
+        greedy = QValueActor(TensorDictSequential(features, values), in_keys=features.in_keys, spec=action_spec)
+        self.is_double = double
+        self.set_networks(greedy, action_spec, learning_rate)
 
     def experience(self, batch: TensorDictBase) -> TensorDictBase:
         """Return every step as a transition of up to ``n_steps`` steps."""
@@ -91,7 +90,7 @@ class DQN(QLearner):
         return batch.select(*seen, "action", *after, "steps_to_next_obs").reshape(-1)
 
     def loss(self, batch: Data, others: Data | None = None) -> TensorsByName:
-        """Compute the loss of transitions, as TorchRL's `DQNLoss` does, and their squared errors, ``td_error``.
+        """Compute the loss of transitions, as TorchRL's ``DQNLoss`` does, and their squared errors, ``td_error``.
 
         The prediction is the value of the action taken; the target is the multi-step reward plus the discounted value
         of the best action after it, by the target network.
@@ -104,7 +103,7 @@ class DQN(QLearner):
         predicted = self.values(batch).gather(-1, batch["action"].unsqueeze(-1)).squeeze(-1)
         with torch.no_grad():
             later = self.with_others(others, type(self).values, after)
-            best = (self.values(after) if self.dqn.double_dqn else later).argmax(dim=-1, keepdim=True)
+            best = (self.values(after) if self.is_double else later).argmax(dim=-1, keepdim=True)
             gamma = later.new_tensor(self.gamma) ** batch["steps_to_next_obs"].view_as(batch["next", "reward"])
             running = (~batch["next", "terminated"]).int()
             target = (batch["next", "reward"] + gamma * running * later.gather(-1, best)).squeeze(-1)

@@ -44,7 +44,7 @@ from baselines.parts.networks import (
     require_weights,
 )
 from baselines.parts.networks import encoder as make_encoder
-from baselines.parts.q_learning import QLearner, WithTarget, require_replay
+from baselines.parts.q_learning import QLearner, require_replay
 from ctgraph_rl.checks import at_least_one, at_most, fraction, not_negative, positive, require, true_or_false
 
 STATE = ("eligibility", "average", "trial")
@@ -276,9 +276,8 @@ class MOHQA(QLearner):
         )
         self.register_buffer("target_weights", self.hebbian.weights.clone())
         self.register_buffer("average", torch.zeros(num_features, dtype=torch.float32, device="cpu"))
-        self.greedy = network = TensorDictSequential(trunk, head)
-        self.target = WithTarget(network)
-        self.set_networks(network, self.target, action_spec, learning_rate)
+        network = TensorDictSequential(trunk, head)
+        self.set_networks(network, action_spec, learning_rate)
         self.policy = ModulatedGreedy(
             trunk,
             head,
@@ -322,12 +321,6 @@ class MOHQA(QLearner):
         self.hebbian.modulate(batch["next", "eligibility"], batch["next", "reward"])
         self.average.copy_(batch["next", "average"][:, -1].mean(dim=0))
         yield from super().minibatches(batch)
-
-    def after_update(self, measured: TensorsByName) -> TensorsByName:
-        """Copy all weights to the target network if it is time."""
-        if self.needs_weights:
-            self.target_weights.copy_(self.hebbian.weights)
-        return super().after_update(measured)
 
     def with_targets(self, batch: TensorDictBase) -> TensorDictBase:
         """See `QLearner`; one step needs none of `MultiStep`'s operations, which take long for a batch of one step."""

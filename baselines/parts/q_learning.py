@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from copy import deepcopy
-from typing import Any, Self
+from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.data import Composite, LazyTensorStorage, TensorDictReplayBuffer, TensorSpec
@@ -15,8 +15,6 @@ from torchrl.data.postprocs import MultiStep
 from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import EGreedyModule
-from torchrl.objectives import HardUpdate
-from torchrl.objectives.common import LossModule
 
 from baselines.parts.learner import MOST_PASSES, Learner
 from baselines.parts.networks import Data, Items, TensorsByName, guided, is_greedy, most_likely
@@ -105,27 +103,11 @@ class EpsilonGreedy(TensorDictSequential):
         return values[0] if isinstance(values, tuple) else values, written
 
 
-class WithTarget(LossModule):
-    """A Q-network and its target network.
-
-    Args:
-        network: a sequence of trunk and head.
-    """
-
-    value_network: TensorDictSequential
-    value_network_params: TensorDictBase
-    target_value_network_params: TensorDictBase
-
-    def __init__(self, network: TensorDictSequential) -> None:
-        super().__init__()
-        self.convert_to_functional(network, "value_network", create_target_params=True)
-
-
 class QLearner(Learner):
     """Learns action values from replayed experience; explores by random actions, less and less within a task.
 
     A class that derives from it calls `set_networks`, and defines `experience` and the loss. A loss that takes
-    ``others`` gets the target network's weights, for `with_others`; the network is then the attribute ``greedy``.
+    ``others`` gets the target network's weights, for `with_others`.
 
     Args:
         num_envs: environments that it learns from.
@@ -200,7 +182,6 @@ class QLearner(Learner):
     def set_networks(
         self,
         greedy: TensorDictModuleBase,
-        objective: LossModule,
         action_spec: TensorSpec,
         learning_rate: float,
         *state: Any,
@@ -210,7 +191,6 @@ class QLearner(Learner):
 
         Args:
             greedy: writes the best ``action``.
-            objective: holds the network and its target network.
             action_spec: the actions that exploration draws from.
             learning_rate: of Adam.
             state: keys under which the network writes its recurrent state.
@@ -221,30 +201,10 @@ class QLearner(Learner):
         for module in copied:
             keys += module.out_keys
         self.policy = EpsilonGreedy(greedy, self.exploration, *copied, selected_out_keys=keys)
-        self.set_target_update(objective, age=0)
+        self.greedy = greedy
+        self.target = deepcopy(greedy).requires_grad_(False)
+        self.target_age = 0
         self.optimiser = make_optimiser("adam", greedy.parameters(), learning_rate)
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        """Return an equal and independent learner.
-
-        TensorDicts copy parameters that are shared once more, so the objective gets those of the network's copy, and
-        the target network its own values.
-        """
-        made = type(self).__new__(type(self))
-        memo[id(self)] = made
-        for name, value in vars(self).items():
-            made.__dict__[name] = deepcopy(value, memo)
-        objective = made.target_update.loss_module
-        objective.value_network_params = TensorDict.from_module(objective.value_network, as_module=True)
-        target = objective.target_value_network_params.data.clone()
-        made.set_target_update(objective, self.target_update.counter)
-        objective.target_value_network_params.data.update_(target)
-        return made
-
-    def set_target_update(self, objective: LossModule, age: int) -> None:
-        """Set what copies the weights to the target network, which they are copied to now, and its age."""
-        self.target_update = HardUpdate(objective, value_network_update_interval=self.target_update_interval - 1)
-        self.target_update.counter = age
 
     def start_task(self, task: int | None = None) -> None:
         """Reset exploration; clear the replay buffer if so configured."""
@@ -254,13 +214,12 @@ class QLearner(Learner):
 
     def other_weights(self) -> TensorsByName:
         """Return the target network's weights."""
-        kept = self.target_update.loss_module.target_value_network_params
-        return {f"greedy.{name}": value for name, value in kept.flatten_keys(".").items()}
+        return {f"greedy.{name}": value for name, value in self.target.named_parameters()}
 
     def weights_changed(self) -> None:
         """Copy the weights to the target network."""
-        self.target_update.counter = self.target_update.value_network_update_interval
-        self.target_update.step()
+        self.target.load_state_dict(self.greedy.state_dict())
+        self.target_age = 0
 
     def values(self, data: Data) -> Tensor:
         """Compute the network's action values, [..., num_actions]."""
@@ -299,7 +258,9 @@ class QLearner(Learner):
         if self.prioritized and squared is not None:
             self.mean_measurements([measured])  # raises before a priority becomes NaN
             self.replay.update_priority(self.replayed, squared.cpu().sqrt())
-        self.target_update.step()
+        self.target_age += 1
+        if self.target_age == self.target_update_interval:
+            self.weights_changed()
         return measured
 
     def after_batch(self, measurements: dict[str, float]) -> dict[str, float]:
@@ -310,7 +271,7 @@ class QLearner(Learner):
     @property
     def needs_weights(self) -> bool:
         """Whether the target network gets the weights after the next gradient step."""
-        return self.prioritized or self.target_update.counter == self.target_update.value_network_update_interval
+        return self.prioritized or self.target_age == self.target_update_interval - 1
 
     def get_extra_state(self) -> NamedValues:
         """Return the optimiser's state, the replay buffer and the age of the target network in gradient steps."""
@@ -318,10 +279,10 @@ class QLearner(Learner):
         for items in replay["_storage"]["_storage"].values():
             if isinstance(items, Tensor):  # unused places hold anything; equal agents have equal states
                 items[replay["_storage"]["_len"] :] = 0
-        return {**super().get_extra_state(), "replay": replay, "target_age": self.target_update.counter}
+        return {**super().get_extra_state(), "replay": replay, "target_age": self.target_age}
 
     def set_extra_state(self, state: NamedValues) -> None:
         """Restore what `get_extra_state` returned."""
         super().set_extra_state(state)
         self.replay.load_state_dict(state["replay"])
-        self.target_update.counter = state["target_age"]
+        self.target_age = state["target_age"]

@@ -19,7 +19,7 @@ from torchrl.modules import QValueActor
 from baselines.cells.cell import MakeCell, linear_layer
 from baselines.cells.lstm import LSTM
 from baselines.parts.networks import Data, TensorsByName, copied_action, num_actions_of, recurrent, require_weights
-from baselines.parts.q_learning import QLearner, WithTarget, require_replay
+from baselines.parts.q_learning import QLearner, require_replay
 from ctgraph_rl.checks import at_least_one, is_int, positive, require
 from ctgraph_rl.learn.collect import UNSTORED
 
@@ -96,13 +96,10 @@ class RecurrentQ(QLearner):
         require((stored, f"{message}: use agent=lstm_ppo"))
         head = Quantiles(hidden_size, num_actions, self.num_quantiles)
         values = TensorDictModule(head, in_keys=["memory"], out_keys=["action_value", "quantiles"])
-        self.greedy = QValueActor(
-            TensorDictSequential(self.trunk, values), in_keys=self.trunk.in_keys, spec=action_spec
-        )
-        self.targets = WithTarget(self.greedy)
+        greedy = QValueActor(TensorDictSequential(self.trunk, values), in_keys=self.trunk.in_keys, spec=action_spec)
         state = self.trunk.out_keys[1:]
         copied = copied_action(self.trunk.in_keys)
-        self.set_networks(self.greedy, self.targets, action_spec, learning_rate, *state, copied=copied)
+        self.set_networks(greedy, action_spec, learning_rate, *state, copied=copied)
 
     def values(self, data: Data) -> Tensor:
         """Compute the means of the network's quantiles."""

@@ -286,7 +286,7 @@ def _gains_from_stacking(learner: Learner) -> bool:
 
 def _most_at_once(learner: Learner) -> int:
     """Return how many seeds a compiled step takes: their tensors stay in the cache from one step to the next."""
-    of_one = sum(4 * parameter.numel() * parameter.element_size() for parameter in learner.parameters())
+    of_one = sum(4 * parameter.numel() * parameter.element_size() for parameter in learner.weights)
     return max(1, CACHED_BYTES // of_one)
 
 

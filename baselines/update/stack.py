@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import cast
 
 import torch
-from tensordict.nn import TensorDictParams
 from torch import Tensor, nn
 from torch.fx import GraphModule
 from torch.fx.experimental.proxy_tensor import make_fx
@@ -17,13 +16,13 @@ from baselines.update.update import Parts, UpdateState, over_seeds, parts_of, st
 
 
 def named_tensors(learner: Learner) -> TensorsByName:
-    """Return a learner's parameters and buffers by name, in an order that depends only on its structure."""
+    """Return a learner's parameters and buffers by name, without other weights, in an order of its structure."""
+    others = {id(value) for value in learner.other_weights().values()}
     found = {}
     for path, module in learner.named_modules():
-        if not isinstance(module, TensorDictParams):
-            for name, value in (*module._parameters.items(), *module._buffers.items()):
-                if value is not None:
-                    found[f"{path}.{name}" if path else name] = value
+        for name, value in (*module._parameters.items(), *module._buffers.items()):
+            if value is not None and id(value) not in others:
+                found[f"{path}.{name}" if path else name] = value
     return found
 
 

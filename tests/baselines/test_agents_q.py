@@ -73,7 +73,7 @@ def test_dqn_copies_to_its_target_network_once_in_every_interval_of_gradient_ste
     step, targets = agent.gradient_step, []
 
     def target_network():
-        return agent.dqn.target_value_network_params.clone()
+        return torch.nn.utils.parameters_to_vector(agent.target.parameters()).clone()
 
     agent.gradient_step = lambda batch: (targets.append(target_network()), step(batch))[1]
     agent.learn(batches(agent, ct_su_b1(), 1)[0])
@@ -209,7 +209,8 @@ def test_recurrent_targets_are_those_by_hand(small_agent, monkeypatch):
     agent = small_agent("drqn", [ct_su_b1()])
     online = torch.tensor([[[1.0, 0.0], [0.0, 2.0], [5.0, 4.0], [0.0, 1.0]]]).unsqueeze(-1)
     later = torch.tensor([[[9.0, 9.0], [9.0, 9.0], [6.0, 9.0], [9.0, 8.0]]]).unsqueeze(-1)
-    agent.targets.target_value_network_params.data.zero_()
+    for parameter in agent.target.parameters():
+        parameter.zero_()
     head = agent.greedy.module[0].module[1].module
     monkeypatch.setattr(RecurrentQ, "quantiles", lambda self, batch: online if head.linear.weight.any() else later)
     given = []

@@ -15,7 +15,7 @@ from torch.fx import symbolic_trace
 from torch.nn.utils.rnn import PackedSequence
 from torchrl.envs.utils import set_exploration_type
 from torchrl.modules import LSTMModule, set_recurrent_mode
-from torchrl.objectives import A2CLoss, ClipPPOLoss, ReinforceLoss, ValueEstimators
+from torchrl.objectives import A2CLoss, ClipPPOLoss, DQNLoss, ReinforceLoss, ValueEstimators
 
 from baselines.cells.lstm import lstm_inputs, lstm_step
 from baselines.cells.packed import Segments
@@ -187,11 +187,13 @@ def test_a_loss_and_its_gradients_in_plain_tensors_equal_torchrls(small_agent, n
 def test_the_loss_of_dqn_in_plain_tensors_equals_torchrls(small_agent, double):
     agent = small_agent("dqn", [ct_su_b1()], f"agent.double={double}", "agent.priority_alpha=0.6")
     agent.learn(batches(agent, ct_su_b1(), 1)[0])
-    agent.dqn.make_value_estimator(ValueEstimators.TD0, gamma=agent.gamma)
+    of_torchrl = DQNLoss(agent.greedy, delay_value=True, double_dqn=agent.is_double, action_space="categorical")
+    of_torchrl.target_value_network_params.data.update_(TensorDict.from_module(agent.target).data)
+    of_torchrl.make_value_estimator(ValueEstimators.TD0, gamma=agent.gamma)
     sample = agent.replay[:].set("priority_weight", torch.rand(128))
 
     losses = agent.loss(sample)
-    expected = agent.dqn(sample)
+    expected = of_torchrl(sample)
 
     assert torch.equal(losses["loss_value"], expected["loss"])
     assert torch.equal(losses["td_error"], sample["td_error"].flatten())

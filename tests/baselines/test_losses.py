@@ -63,8 +63,7 @@ def test_dqn_takes_the_online_networks_best_action_at_the_target_networks_value(
     loss = agent.loss(batch)["loss_value"]
 
     online = _values(agent, batch["next", "observation"])
-    with agent.dqn.target_value_network_params.to_module(agent.dqn.value_network):
-        of_target = agent.dqn.value_network(_observed(batch["next", "observation"]))["action_value"]
+    of_target = agent.target(_observed(batch["next", "observation"]))["action_value"]
     assert (online.argmax(-1) != of_target.argmax(-1)).any()
     value = of_target.gather(-1, online.argmax(-1, keepdim=True))
     target = batch["next", "reward"] + 0.5 * value * ~batch["next", "terminated"]

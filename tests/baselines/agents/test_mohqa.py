@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from copy import deepcopy
 
 import pytest
 import torch
@@ -131,14 +132,15 @@ def test_the_target_is_the_sum_of_both_networks_and_the_prediction_only_where_co
 
     loss = agent.loss(minibatch)["loss_value"]
 
-    def both(data, average, weights):
-        features = agent.policy.features(data)
-        return agent.policy.head(features), linear((features - average).tanh(), weights).sigmoid()
+    def both(learner, data, average, weights):
+        features = learner.policy.features(data)
+        return learner.policy.head(features), linear((features - average).tanh(), weights).sigmoid()
 
-    q, u = both(minibatch, minibatch["average"], agent.hebbian.weights)
-    with agent.target.target_value_network_params.to_module(agent.policy.greedy):
-        after = {"observation": minibatch["next", "observation"]}
-        target_q, target_u = both(after, minibatch["next", "average"], agent.target_weights)
+    q, u = both(agent, minibatch, minibatch["average"], agent.hebbian.weights)
+    later = deepcopy(agent)
+    later.greedy.load_state_dict(agent.target.state_dict())
+    after = {"observation": minibatch["next", "observation"]}
+    target_q, target_u = both(later, after, minibatch["next", "average"], agent.target_weights)
     running = ~minibatch["next", "terminated"].squeeze(-1)
     target = minibatch["next", "reward"].squeeze(-1) + 0.6 * running * (target_q + target_u).amax(dim=-1)
     predicted = (q + u if predict_sum else q).gather(-1, minibatch["action"].unsqueeze(-1)).squeeze(-1)
@@ -160,7 +162,7 @@ def test_the_copy_of_the_hebbian_weights_is_as_old_as_the_target_network(small_a
     for batch in batches(agent, ct_su_b1(), 4):
         agent.learn(batch)
         online = [value.clone() for value in agent.policy.greedy.parameters()]
-        copied = agent.target.target_value_network_params.values(True, True)
+        copied = list(agent.target.parameters())
         copies.append((torch.equal(agent.target_weights, agent.hebbian.weights), all(map(torch.equal, copied, online))))
 
     assert [each[0] for each in copies] == [each[1] for each in copies] == [False, False, True, False]

@@ -241,19 +241,16 @@ def test_a_run_goes_on_from_the_end_of_a_block_that_has_shortened_the_sequences_
     assert equal(dict(resumed.state_dict()), dict(whole.state_dict()))
 
 
-def test_a_state_of_kept_minibatches_of_one_length_is_read_as_it_once_was_saved():
+def test_kept_minibatches_of_one_length_are_restored():
     samples, restored = Samples(8), Samples(8)
     for size in (3, 5):
         samples.remaining = 8
         samples.add({"action": torch.rand(size, 2), "learnt": torch.rand(size, 2) < 0.5})
-    (part,) = samples.state()["parts"]
 
-    for state in (samples.state(), part):
-        restored.restore(state, torch.device("cpu"))
-        assert restored.num_held == samples.num_held
-        assert equal(restored.state(), samples.state())
-    restored.restore({"sizes": [], "items": {}}, torch.device("cpu"))
-    assert not restored.minibatches
+    restored.restore(samples.state(), torch.device("cpu"))
+
+    assert restored.num_held == samples.num_held
+    assert equal(restored.state(), samples.state())
 
 
 def test_frames_that_are_not_learned_from_do_not_count_among_the_samples():

@@ -81,9 +81,8 @@ def test_the_target_network_gets_the_task_s_output_layers(compose):
 
     attached.start_task(1)
 
-    target = attached.agent.dqn.target_value_network_params.flatten_keys(".")
-    online = attached.agent.dqn.value_network_params.flatten_keys(".")
-    assert all(torch.equal(target[key], online[key]) for key in online.keys())  # noqa: SIM118
+    agent = attached.agent
+    assert all(map(torch.equal, agent.target.parameters(), agent.greedy.parameters()))
 
 
 def test_an_agent_without_layers_behind_a_trunk_has_no_output_layers_to_swap():

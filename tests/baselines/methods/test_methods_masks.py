@@ -183,9 +183,8 @@ def test_the_target_network_follows_where_weights_are_changed(compose, name):
 
     attached.start_task(1)
 
-    loss = attached.agent.dqn
-    target, online = (part.flatten_keys(".") for part in (loss.target_value_network_params, loss.value_network_params))
-    assert all(torch.equal(target[key], online[key]) for key in online.keys())  # noqa: SIM118
+    agent = attached.agent
+    assert all(map(torch.equal, agent.target.parameters(), agent.greedy.parameters()))
 
 
 def test_a_policy_for_another_task_explores_as_the_present_one_does(compose):
