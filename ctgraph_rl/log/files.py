@@ -98,9 +98,11 @@ def _locked(path: Path, folder: Path, waiting: Callable[[], object] | None) -> I
     try:
         yield
     finally:
-        if not file.closed and _is_still_there(file, path):  # not a fork's, nor where another folder is in its place
-            path.unlink(missing_ok=True)
-        file.close()
+        try:
+            if not file.closed and _is_still_there(file, path):  # not a fork's, nor that of another folder
+                path.unlink(missing_ok=True)
+        finally:
+            file.close()
 
 
 def _lock(path: Path, folder: Path, waiting: Callable[[], object] | None) -> BinaryIO:

@@ -276,12 +276,13 @@ class Sweeper(Base):
     def _jobs(self, cells: Mapping[Path, Overrides]) -> dict[Overrides, list[Path]]:
         """Return the settings of jobs, each with the cells that it runs: one, or with ``together`` those of all seeds.
 
-        Cells that were begun together stay together, and one that was begun by itself stays so.
+        Cells that were begun together stay together, with those of them that have no checkpoint yet, and one that was
+        begun by itself stays so.
         """
         assert self.config is not None
         if not self.config.together:
             return {tuple(overrides): [folder] for folder, overrides in cells.items()}
-        groups: dict[Any, dict[str, Path]] = {}
+        by_seed: dict[Overrides, dict[str, Path]] = {}
         for folder, overrides in cells.items():
             seed = ""
             others = []
@@ -291,9 +292,14 @@ class Sweeper(Base):
                     seed = value
                 elif key != "together":
                     others.append(setting)
-            begun = self._begun.get(folder)
-            alone = seed if begun == () or not seed else ""
-            groups.setdefault((tuple(others), begun, alone), {})[seed] = folder
+            by_seed.setdefault(tuple(others), {})[seed] = folder
+        groups: dict[Any, dict[str, Path]] = {}
+        for alike, folders in by_seed.items():
+            group_of = {str(seed): begun for begun in map(self._begun.get, folders.values()) for seed in begun or ()}
+            for seed, folder in folders.items():
+                begun = self._begun.get(folder, group_of.get(seed))
+                alone = seed if begun == () or not seed else ""
+                groups.setdefault((alike, begun, alone), {})[seed] = folder
         jobs: dict[Overrides, list[Path]] = {}
         for (shared, *_), group in groups.items():
             first = next(iter(group))

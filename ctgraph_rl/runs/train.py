@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import sys
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -199,8 +200,6 @@ class RunDirectory:
             remove_results(run_dir)  # what a run left that was stopped before its first checkpoint
             log = RunLog(run_dir / LOG)
         else:
-            if saved["frames"] < curriculum.num_frames:
-                require(_same_group(run_dir, self.together))
             log = resumed_log(run_dir, saved, about, self.checkpoints.strict)
         log.listeners.extend(self.listeners)
         if saved is None:
@@ -233,8 +232,7 @@ def train_alone(curriculum: Curriculum, agent: Agent, where: RunDirectory, seed:
     check_rows(curriculum, agent.num_envs)
     check_ids(curriculum, agent)
     checkpoints = where.checkpoints
-    checkpoints.tidy()
-    saved = checkpoints.newest()
+    [saved] = _resumed_states(curriculum, [agent], [where])
     if saved is not None and "failed" in saved:
         checkpoints.clear()
         raise FloatingPointError(saved["failed"])
@@ -261,6 +259,7 @@ def train_together(
     """Let the agents of several seeds learn a curriculum as one batch; each is a run in its own directory.
 
     Runs that were stopped are resumed from the last checkpoint that all have, and end as if they had never stopped.
+    Those that were stopped in their first checkpoints begin again.
 
     Args:
         curriculum: what is learned.
@@ -276,10 +275,11 @@ def train_together(
         ValueError: before any work, for an agent that cannot learn the curriculum, and runs that cannot be resumed.
     """
     checkpoints = [each.checkpoints for each in directories]
-    for each in checkpoints:
-        each.tidy()
-    saved = newest_of_all(checkpoints)
-    done = 0 if saved is None else saved[0]["frames"]
+    states = _resumed_states(curriculum, group.agents, directories)
+    saved = [state for state in states if state is not None] or None
+    done = saved[0]["frames"] if saved else 0
+    if saved:
+        print(f"note: {len(saved)} seeds are resumed as one batch, after {done:,} frames", file=sys.stderr)
     progress = ProgressBar(len(curriculum.blocks), curriculum.num_frames, directories[0].console, done)
 
     def learn(logs: Sequence[RunLog]) -> Failures:
@@ -288,7 +288,7 @@ def train_together(
 
     pairs = zip(group.agents, directories, strict=True)
     participants = [Participant(curriculum, agent, directory) for agent, directory in pairs]
-    failed = execute(participants, saved or [None] * len(participants), learn, progress)
+    failed = execute(participants, states, learn, progress)
     for number in failed:  # last: the others could not be resumed beside a seed without a checkpoint
         directories[number].checkpoints.clear()
     return failed
@@ -332,12 +332,50 @@ def execute(
     return failed
 
 
+def _resumed_states(
+    curriculum: Curriculum, agents: Sequence[Agent], directories: Sequence[RunDirectory]
+) -> Sequence[RunState | None]:
+    """Return the state that each of the runs that learn together is resumed from; None for all where they begin.
+
+    Runs begin again where one has no checkpoint or was begun in another group, if all were stopped after their first
+    update.
+
+    Raises:
+        ValueError: if more than that would be lost.
+    """
+    for each in directories:
+        each.checkpoints.tidy()
+    begun = [each for each in directories if each.checkpoints.files()]
+    saved = newest_of_all([each.checkpoints for each in directories])
+    rules = [_same_group(each.run_dir, each.together) for each in begun]
+    if len(begun) < len(directories):
+        rules = [_all_begun(each.run_dir, begun) for each in directories if each not in begun]
+    can_resume = saved is not None and (saved[0]["frames"] == curriculum.num_frames or all(rule for rule, _ in rules))
+    if saved is not None and can_resume:
+        return saved
+    one_update = agents[0].num_envs * agents[0].num_steps
+    if any((each.checkpoints.newest_frames or 0) > one_update for each in begun):
+        require(*rules)
+    for each in begun:
+        each.checkpoints.clear()
+        why = "it was stopped in its group's first checkpoints, after one update"
+        print(f"note: {terminal_text(each.run_dir)} begins again: {why}", file=sys.stderr)
+    return [None] * len(directories)
+
+
 def _same_group(run_dir: Path, together: Sequence[int]) -> Rule:
     """The rule that a run is resumed with the seeds beside it with which it was begun, if there were any."""
     before = (RunLog.begun(run_dir / LOG) or {}).get("together", [])
     how = "together=true and seed=" + ",".join(map(str, before)) if before else "together=false"
     began = f"{run_dir} was begun {f'with the seeds {before} together' if before else 'by itself'}"
     return before == list(together), f"{began}: resume it with {how}, or start again with overwrite=true"
+
+
+def _all_begun(run_dir: Path, others: Sequence[RunDirectory]) -> Rule:
+    """The rule that no run of a group has lost its checkpoints, if others have some."""
+    named = ", ".join(str(each.run_dir) for each in others)
+    lost = f"{run_dir} has lost its checkpoints, and learns as one batch with {named}, which have some"
+    return not others, f"{lost}: restore them, or start all again with overwrite=true"
 
 
 def write_curriculum(curriculum: Curriculum, run_dir: Path) -> None:

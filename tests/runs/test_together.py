@@ -150,6 +150,49 @@ def test_a_stopped_group_is_resumed_as_a_group_bit_by_bit_and_not_otherwise(
     assert all((run / "restarts.jsonl").exists() for run in runs()[:3])
 
 
+@pytest.mark.parametrize("is_full", [False, True])
+def test_a_group_that_is_stopped_in_its_first_checkpoints_begins_again_and_says_so(
+    monkeypatch, capsys, together, is_full
+):
+    settings = (SEEDS, "together=true", *PPO)
+    save = checkpoints.Checkpoints.save
+    calls: list[int] = []
+
+    def stopped(saved, state):
+        calls.append(1)
+        if len(calls) == 2:
+            raise OSError(errno.ENOSPC, "No space left on device") if is_full else KeyboardInterrupt
+        save(saved, state)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoints.Checkpoints, "save", stopped)
+        assert sweep(patch, *settings) == (1 if is_full else 130)
+    assert [bool(checkpoints.Checkpoints(run / "checkpoints").files()) for run in runs()] == [True, False, False]
+    capsys.readouterr()
+
+    assert sweep(monkeypatch, *settings) == 0
+
+    assert "seed0-984641b8a2ea begins again: it was stopped in its group's first check" in capsys.readouterr().err
+    assert all(same(run, together / run.relative_to("runs")) for run in runs())
+
+
+def test_a_group_of_which_one_lost_its_checkpoints_is_not_begun_again_where_the_others_have_learned_more(
+    monkeypatch, capsys
+):
+    settings = ("seed=0,1", "together=true", *PPO)
+    with monkeypatch.context() as patch:
+        stop_after(patch, 2)
+        assert sweep(patch, *settings) == 130
+    shutil.rmtree(runs()[1] / "checkpoints")
+    before = [path.read_bytes() for path in runs()[0].rglob("*.pt")]
+    capsys.readouterr()
+
+    assert sweep(monkeypatch, *settings) == 1
+
+    assert "seed1-548973f7123c has lost its checkpoints, and learns as one batch with" in capsys.readouterr().out
+    assert [path.read_bytes() for path in runs()[0].rglob("*.pt")] == before != []
+
+
 @pytest.mark.slow
 def test_a_group_that_meets_a_full_disk_at_a_file_of_its_results_is_resumed_bit_by_bit(monkeypatch):
     settings = ("seed=0,1", *PPO)
