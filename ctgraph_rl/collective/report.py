@@ -33,7 +33,7 @@ SHOWN = (
 """Columns of the page's table."""
 
 MEANING = (
-    f"learning_time: mean over members and blocks of the frames until a batch has a mean return of {MASTERED}; a block "
+    f"learning_time: mean over members and blocks of the frames until {MASTERED} of a batch are at the goal; a block "
     "without one counts with all its frames. share_learned: share of blocks with one. final_return: sum over members "
     "of the mean return of the last five batches of a block. sent, dropped, delayed, refused: messages. bytes: of what "
     "was sent. helps: masks that were taken over."

@@ -47,7 +47,7 @@ class Learned(NamedTuple):
     block: int  # from 1
     label: str
     frames: int  # of the block
-    frames_to_learn: int | None  # until a batch had a mean return of `MASTERED`; None if none had
+    frames_to_learn: int | None  # until `MASTERED` of a batch's episodes were at the goal; None if never
     final_return: float  # mean of the last batches with finished episodes; NaN without any
 
 
@@ -132,7 +132,7 @@ def _learned(path: Path, number: int, about: ReadOnlyValues) -> Iterator[Learned
     start = 0
     for block, own in sorted(lines.items()):
         known = [line for line in own if line["return_mean"] is not None]
-        reached = [line["frames"] - start for line in known if line["return_mean"] >= MASTERED]
+        reached = [line["frames"] - start for line in known if _is_mastered(line)]
         last = [line["return_mean"] for line in known[-LAST:]]
         label = " ".join(about["labels"][task - 1] for task in trained[block - 1])
         end = own[-1]["frames"]
@@ -147,6 +147,12 @@ def _learned(path: Path, number: int, about: ReadOnlyValues) -> Iterator[Learned
             final_return=final,
         )
         start = end
+
+
+def _is_mastered(batch: ReadOnlyValues) -> bool:
+    """Return whether a batch's episodes are at the goal; by their return where tasks have no goal."""
+    share = batch.get("success_rate")
+    return bool((batch["return_mean"] if share is None else share) >= MASTERED)
 
 
 def describe_collective(collective: Collective) -> str:
@@ -209,8 +215,8 @@ def metrics(collective: Collective) -> dict[str, Metric]:
     values = {
         "learning_time": (
             collective.learning_time,
-            "mean over members and blocks of the frames until a batch has a "
-            f"mean return of {MASTERED}; all frames of a block that has none",
+            f"mean over members and blocks of the frames until a batch has {MASTERED} of its episodes at the goal, or "
+            "that mean return in tasks without goals; all frames of a block that has no such batch",
         ),
         "share_learned": (collective.share_learned, "share of members' blocks with such a batch"),
         "final_return": (collective.final_return, f"sum over members of the mean return of the last {LAST} batches"),

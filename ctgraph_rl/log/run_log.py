@@ -346,18 +346,19 @@ class RunLog:
             fields.append(torch.stack([_row([m.get(name) for m in row]) for row in last]))
         return Adaptation(*fields)
 
-    def curves(self, trained: Trained | None = None) -> Curves:
+    def curves(self, trained: Trained | None = None, name: str = "return_mean") -> Curves:
         """All evaluations of the curriculum's tasks in time order, those during blocks included.
 
         Args:
             trained: for each block, its tasks counted from 0; default: as the log says.
+            name: the field that is the performance.
 
         Raises:
             ValueError: if nothing was evaluated.
         """
         points: dict[tuple[int, int], dict[int, float]] = {}
         for m in self._evaluations(during=True):
-            points.setdefault((m["block"], m["frames"]), {})[m["task"]] = m["return_mean"]
+            points.setdefault((m["block"], m["frames"]), {})[m["task"]] = m.get(name)
         require((bool(points), "this log has no evaluation"))
         blocks, frames = zip(*points, strict=True)
         of_blocks = self._trained(trained)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -22,6 +23,7 @@ from ctgraph_rl.metrics.record import float64
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.task_like import TaskLike
 from ctgraph_rl.tasks.observability import POLICIES, state_entropy
+from ctgraph_rl.tasks.protocol import Evaluation
 from ctgraph_rl.tasks.task import Task, are_graphs
 from ctgraph_rl.tasks.values import (
     memoryless_ceiling,
@@ -116,7 +118,8 @@ def _facts(curriculum: Curriculum) -> NamedValues:
     tasks = curriculum.tasks
     known = {
         "trained": curriculum.trained,
-        "mastered_returns": mastered_returns(tasks),
+        "mastery_thresholds": mastery_thresholds(tasks),
+        "evaluation_noise": float64([evaluation_noise(task, curriculum.evaluation) for task in tasks]),
         "best": optimal_values(tasks),
         "zero": lowest_returns(tasks),
     }
@@ -145,13 +148,17 @@ def _measured(
     """Return the inputs that a finished run has measured."""
     count = len(curriculum.tasks)
     curves: Curves | Undefined
+    mastery: Curves | Undefined
     try:
         curves = protocol_curves(log, curriculum)
+        mastery = _mastery_curves(log, curriculum, curves)
     except Undefined as reason:
         curves = reason
+        mastery = reason
     return {
         "performance": log.performance(count),
         "curves": curves,
+        "mastery_curves": mastery,
         "end_rates": log.last("end_rate", count),
         "success_rates": log.last("success_rate", count),
         "adaptation": _adaptation(log, held_out=False),
@@ -257,23 +264,53 @@ def _of_each(value: Callable[[Any], float], tasks: Sequence[Any]) -> Tensor | Un
         return Undefined(str(error))
 
 
-def mastered_returns(tasks: Sequence[TaskLike]) -> Tensor | Undefined:
-    """The mean return from which on each task is mastered, float64 [tasks]; NaN as for `optimal_values`.
+def mastery_thresholds(tasks: Sequence[TaskLike]) -> Tensor | Undefined:
+    """From which value on each task is mastered, float64 [tasks]; NaN as for `optimal_values`.
 
-    It is `metrics.MASTERED` times a positive optimal value, and that share of the way from the worst possible mean
-    return to any other, so that the optimal policy masters every task.
+    Without noise of rewards it is a mean return: `metrics.MASTERED` times a positive optimal value, and that share of
+    the way from the worst possible mean return to any other, so that the optimal policy masters every task. With noise
+    it is `metrics.MASTERED` of the episodes at the goal, NaN where the goal does not pay most.
     """
     best = optimal_values(tasks)
     if isinstance(best, Undefined):
         return best
     share = metrics.MASTERED
     positive = (best > 0) | best.isnan()
-    if positive.all():
-        return share * best
-    worst = _of_each(partial(_known, worst_value), tasks) if are_graphs(tasks) else lowest_returns(tasks)
-    if isinstance(worst, Undefined):
-        return worst
-    return torch.where(positive, share * best, best - (1 - share) * (best - worst))
+    returns = share * best
+    if not positive.all():
+        worst = _of_each(partial(_known, worst_value), tasks) if are_graphs(tasks) else lowest_returns(tasks)
+        if isinstance(worst, Undefined):
+            return worst
+        returns = torch.where(positive, returns, best - (1 - share) * (best - worst))
+    if not are_graphs(tasks):
+        return returns
+    pays = torch.tensor([task.goal_reward > max(task.fail_reward, 0) for task in tasks])
+    shares = torch.where(pays, share, torch.nan).double()
+    return torch.where(_have_noise(tasks), shares, returns)
+
+
+def evaluation_noise(task: TaskLike, evaluation: Evaluation) -> float:
+    """Return the standard deviation of the noise of rewards in a task's mean return, at most.
+
+    Where agents adapt, the mean is that of one place in each row. Exact means have none.
+    """
+    if evaluation.exact or not isinstance(task, Task):
+        return 0.0
+    episodes = evaluation.num_episodes
+    if evaluation.adapt_episodes > 0:
+        episodes //= evaluation.episodes_per_row
+    return task.return_noise / math.sqrt(episodes)
+
+
+def _have_noise(tasks: Sequence[TaskLike]) -> Tensor:
+    return torch.tensor([isinstance(task, Task) and task.reward_std > 0 for task in tasks])
+
+
+def _mastery_curves(log: RunLog, curriculum: Curriculum, returns: Curves) -> Curves:
+    """Return the curves with the share of episodes at the goal for tasks whose rewards have noise."""
+    have_noise = _have_noise(curriculum.tasks)
+    shares = log.curves(curriculum.trained, "success_rate").performance
+    return replace(returns, performance=torch.where(have_noise, shares, returns.performance))
 
 
 def _known(value: Callable[[Task, float], float], task: Task) -> float:

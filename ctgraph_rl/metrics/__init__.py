@@ -70,8 +70,8 @@ def of_matrix(performance: Tensor, trained: Trained) -> NamedMetrics:
 
 
 def of_curves(curves: Curves) -> NamedMetrics:
-    """Compute all metrics of evaluation curves that need no expert."""
-    return of_inputs({"curves": curves})
+    """Compute all metrics of evaluation curves that need no expert; of returns without noise."""
+    return of_inputs({"curves": curves, "mastery_curves": curves})
 
 
 def of_regimes(regimes: Sequence[Regime], experts: Mapping[str, Sequence[Tensor]] | None = None) -> NamedMetrics:

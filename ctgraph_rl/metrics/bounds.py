@@ -6,6 +6,9 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+NOISE = 4
+"""Standard deviations that the noise of a mean return may reach."""
+
 
 class Known(NamedTuple):
     """Bounds on the numbers of a run: of what is measured, so neither the optimum nor a mean over episodes is one."""

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl.metrics.bounds import (
+    NOISE,
     not_negative,
     of_changes_but_one,
     of_counts,
@@ -25,6 +26,8 @@ from ctgraph_rl.metrics.record import HERE, MASTERED, Undefined, defined, float6
 CONTINUAL_WORLD = "Wolczyk et al. 2021, Continual World (arXiv 2105.10919)"
 LABS = "Ben-Iwhiwhu et al. 2022, Lifelong RL with modulating masks (arXiv 2212.11110)"
 LABS_CODE = "evaluation code of the CT-graph labs"
+
+OF_MASTERY = {"curves": "mastery_curves", "threshold": "mastery_thresholds"}
 
 
 @dataclass(frozen=True)
@@ -170,32 +173,39 @@ def total_performance_over_time(curves: Curves) -> Tensor:
 
 @defined(
     "ct-graph-labs/relative-forgetting",
-    "mean_j (max_t p_j(t) - p_j(end)) / max_t p_j(t)",
+    "mean_j (max_t p_j(t) - p_j(end)) / max_t p_j(t), of tasks j with max_t p_j(t) > 4 noise_j",
     LABS_CODE,
     partial=True,
-    missing="a task never got above 0",
+    missing="a task never got above 0, and the noise of its rewards",
+    inputs={"noise": "evaluation_noise"},
     bounds=of_lost_shares,
 )
-def relative_forgetting(curves: Curves) -> Tensor:
+def relative_forgetting(curves: Curves, noise: Tensor | float = 0.0) -> Tensor:
     """The share of the best performance ever on a task that is gone at the end, over all tasks.
 
     The best is that of the evaluations that there are, as tasks may be evaluated only from their first block on; the
-    last one must be there. A task that never got above 0 has no value and is left out and counted. In [0, 1] for
-    performance that is.
+    last one must be there. A task that never got above 0 has no value and is left out and counted; nor has one whose
+    best may be the noise of its rewards. In [0, 1] for performance that is.
+
+    Args:
+        curves: the evaluations of a run.
+        noise: the standard deviation of the noise in an evaluation's return: a number, or one per task.
     """
     curves.check_whole()
     if curves.performance[-1].isnan().any():
         raise Undefined("the last evaluation of a task is missing")
     best = curves.performance.nan_to_num(nan=-torch.inf).amax(0)
-    return ratio(best - curves.performance[-1], best.clamp(min=0))
+    above_noise = best > NOISE * torch.as_tensor(noise)
+    return ratio(best - curves.performance[-1], torch.where(above_noise, best, 0.0))
 
 
 @defined(
     "ctgraph_rl/tasks-learned",
-    "number of j with p_j(end of j's block) >= threshold_j",
+    "number of j with p_j(end of j's block) >= threshold_j; p_j is the share at the goal where rewards have noise",
     HERE,
+    missing="an evaluation is missing, or what counts as mastered is not known",
     aggregate=torch.sum,
-    inputs={"threshold": "mastered_returns"},
+    inputs=OF_MASTERY,
     bounds=of_counts,
 )
 def tasks_learned(curves: Curves, threshold: Tensor | float = MASTERED) -> Tensor:
@@ -205,9 +215,10 @@ def tasks_learned(curves: Curves, threshold: Tensor | float = MASTERED) -> Tenso
     tasks that are at 0.9 at the very end. A task that no block trains is none.
 
     Args:
-        curves: the evaluations of a run.
-        threshold: what counts as mastered: a number, or one per task. A run takes 0.9 times the optimal value, and
-            where that is not positive 0.9 of the way from the worst possible mean return to it.
+        curves: the evaluations of a run. For a task whose rewards have noise, a run gives shares of episodes at the
+            goal, as noise takes a return beyond any threshold by chance.
+        threshold: what counts as mastered: a number, or one per task. A run takes 0.9 of such a share, else 0.9 times
+            the optimal value, and where that is not positive 0.9 of the way from the worst possible mean return to it.
     """
     ends = curves.ends
     last = {task: block for block, tasks in enumerate(curves.trained, 1) for task in tasks}
@@ -219,10 +230,11 @@ def tasks_learned(curves: Curves, threshold: Tensor | float = MASTERED) -> Tenso
 
 @defined(
     "ctgraph_rl/frames-to-mastery",
-    "mean over tasks j, each with its block, of the frames from the start of j's first block to p_j >= threshold_j",
+    "mean over tasks j, each with its block, of the frames from the start of j's first block to p_j >= threshold_j, "
+    "p_j as in ctgraph_rl/tasks-learned",
     HERE,
     missing="a task was not mastered in its block",
-    inputs={"threshold": "mastered_returns"},
+    inputs=OF_MASTERY,
     bounds=not_negative,
     is_time=True,
 )
@@ -233,8 +245,8 @@ def frames_to_mastery(curves: Curves, threshold: Tensor | float = MASTERED) -> T
     The distance between two evaluations is the resolution.
 
     Args:
-        curves: the evaluations of a run.
-        threshold: as in `tasks_learned`.
+        curves: as in `tasks_learned`.
+        threshold: as there.
     """
     num_tasks = curves.performance.shape[1]
     needed = torch.as_tensor(threshold, dtype=curves.performance.dtype, device="cpu").expand(num_tasks)
@@ -255,6 +267,9 @@ def _frames_to(needed: Tensor, curves: Curves, block: int, task: int) -> float:
         raise Undefined(f"the definition needs an evaluation at the end of block {block - 1}")
     start = curves.frames[before[-1]] if block > 1 else 0
     for row in rows:
-        if curves.performance[row, task] >= needed:
+        reached = curves.performance[row, task]
+        if reached.isnan() or needed.isnan():
+            raise Undefined(f"an evaluation of task {task + 1}, or what counts as mastered, is not known")
+        if reached >= needed:
             return curves.frames[row] - start
     return math.nan

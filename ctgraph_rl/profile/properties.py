@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from ctgraph_rl.checks import by_name
 from ctgraph_rl.log.run_log import RunLog
-from ctgraph_rl.log.scores import mastered_returns, optimal_values
+from ctgraph_rl.log.scores import mastery_thresholds, optimal_values
 from ctgraph_rl.metrics import Undefined
 from ctgraph_rl.metrics.transfer import stage_areas
 from ctgraph_rl.packages import taught_share
@@ -86,7 +86,7 @@ def faster(run: Evidence, on: Sequence[int], than: Sequence[int], learned: bool 
     Raises:
         Undefined: where the others were learned at once, or not at all though they must be.
     """
-    mastered = mastered_returns(run.tasks)
+    mastered = mastery_thresholds(run.tasks)
     assert isinstance(mastered, Tensor)
     missed = [1 + task for task in than if not run.own_returns[task] >= mastered[task]]
     if learned and missed:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 
 from ctgraph_rl.log.files import CURRICULUM
-from ctgraph_rl.log.scores import lowest_returns, optimal_values
+from ctgraph_rl.log.scores import evaluation_noise, lowest_returns, optimal_values
 from ctgraph_rl.metrics import Undefined
 from ctgraph_rl.metrics.bounds import Known, of_performance
 from ctgraph_rl.metrics.record import METRICS
@@ -18,9 +17,11 @@ from ctgraph_rl.report.statistics import Estimate, constant, mean
 from ctgraph_rl.runs.read import Run, grouped, present
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.task_like import TaskLike
+from ctgraph_rl.tasks.protocol import Evaluation
 from ctgraph_rl.tasks.task import are_graphs
 
 NOTHING_KNOWN = Known(UNBOUNDED.low, UNBOUNDED.high, tasks=1, evaluations=1)
+ONE_EPISODE = Evaluation(num_episodes=1)
 
 
 @dataclass(frozen=True)
@@ -98,18 +99,13 @@ def bounds_of_curriculum(curriculum: Curriculum, evaluations: int = 1) -> Bounds
     """
     evaluation = curriculum.evaluation
     tasks = (*curriculum.tasks, *evaluation.held_out)
-    graphs = are_graphs(tasks)
-    episodes = evaluation.num_episodes
-    if evaluation.adapt_episodes > 0:
-        episodes //= evaluation.episodes_per_row  # of each place in a row
     of_evaluation = []
     of_episode = []
     try:
         for task in tasks:
             bounds = Bounds(*task.return_bounds)  # type: ignore[attr-defined]
-            noise = task.return_noise if graphs else 0.0  # type: ignore[attr-defined]
-            of_evaluation.append(bounds.widened(noise / math.sqrt(episodes)))
-            of_episode.append(bounds.widened(noise))
+            of_evaluation.append(bounds.widened(evaluation_noise(task, evaluation)))
+            of_episode.append(bounds.widened(evaluation_noise(task, ONE_EPISODE)))
     except (AttributeError, ValueError):
         return NO_BOUNDS
     whole = _around(of_evaluation)

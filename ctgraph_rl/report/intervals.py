@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ctgraph_rl.metrics.bounds import NOISE
+
 
 class Bounds(NamedTuple):
     """The lowest and the highest value that a seed can have, infinite where it is not known.
@@ -33,9 +35,6 @@ class Bounds(NamedTuple):
         """Return the bounds of the difference of two values."""
         return Bounds(self.low - self.high, self.high - self.low)
 
-
-NOISE = 4
-"""Standard deviations by which noise widens bounds."""
 
 UNBOUNDED = Bounds(-math.inf, math.inf)
 

@@ -220,7 +220,7 @@ def test_a_collective_that_cannot_be_is_refused_in_one_line_and_leaves_nothing(m
     assert not Path("runs").exists()
 
 
-def made(folder: Path, exchange: str, returns, helps=()) -> None:
+def made(folder: Path, exchange: str, returns, helps=(), **measured: float) -> None:
     """Write the directory of a collective by hand: for each member the mean returns of batches of 100 frames."""
     config = {
         part: {"_target_": f"a.{name}"} for part, name in (("agent", "A"), ("method", "M"), ("exchange", exchange))
@@ -234,7 +234,7 @@ def made(folder: Path, exchange: str, returns, helps=()) -> None:
         for block, values in enumerate(blocks, 1):
             for value in values:
                 frames += 100
-                log.append("training", block=block, frames=frames, return_mean=value)
+                log.append("training", block=block, frames=frames, return_mean=value, **measured)
         log.close()
     log = RunLog(folder / "collective.jsonl")
     log.append("collective", config={**config, "seed": 3}, members=members)
@@ -247,6 +247,12 @@ def made(folder: Path, exchange: str, returns, helps=()) -> None:
 
 
 NEVER = [0.0, 0.5, float("nan"), 0.3]
+
+
+def test_a_batch_whose_return_is_large_by_noise_is_not_learned(tmp_path):
+    made(tmp_path / "one", "E", [([1.5], [0.95])], success_rate=0.25)
+
+    assert read_collective(tmp_path / "one").share_learned == 0
 
 
 def test_learning_time_and_helpers_are_those_of_the_logs(tmp_path):

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
 
 import curricula
 from ctgraph_rl import Block, Curriculum, Evaluation, Gradient, RunLog, metrics
-from ctgraph_rl.log.scores import inputs_of, optimal_values, scores
+from ctgraph_rl.log.scores import evaluation_noise, inputs_of, optimal_values, scores
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_su_b1
 from ctgraph_rl.tasks.observability import state_entropy
+from ctgraph_rl.tasks.task import Task
 from ctgraph_rl.tasks.values import open_loop_ceiling, random_frames_to_goal
 
 OF_THE_TASKS = (
@@ -120,10 +122,51 @@ def test_the_optimal_policy_masters_a_task_whatever_the_sign_of_its_optimum(rewa
     evaluate(log, "before", 0, 0, best)
     evaluate(log, "after", 1, 200, best)
 
-    found = inputs_of(log, learned, None)["mastered_returns"].item()
+    found = inputs_of(log, learned, None)["mastery_thresholds"].item()
 
     assert found == pytest.approx(threshold, abs=1e-12)
     assert metrics.tasks_learned(log.curves(learned.trained), found).value == 1
+
+
+def of_noisy(task: Task, returns: Sequence[float], shares: Sequence[float | None]) -> dict[str, metrics.Metric]:
+    """The scores of a run on a task, with its returns and its shares of episodes at the goal."""
+    learned = Curriculum("one", 1, "here", (Block(task, 200),), Evaluation(every=100, num_episodes=4))
+    log = RunLog()
+    moments = ("before", "during", "after")
+    for number, (moment, value, share) in enumerate(zip(moments, returns, shares, strict=True)):
+        evaluate(log, moment, min(number, 1), 100 * number, value)
+        log.measurements[-1] |= {"success_rate": share, "end_rate": 1.0}
+    return scores(log, learned)
+
+
+def test_a_return_that_noise_takes_beyond_a_threshold_is_no_mastery():
+    noisy = replace(ct_su_b1((1, 1)), reward_std=0.4)  # 4 standard deviations of a mean of 4 episodes are 0.8
+
+    never = of_noisy(noisy, (0.7, 1.3, 0.95), (0.0, 0.25, 0.25))
+    late = of_noisy(noisy, (0.0, 1.3, 0.85), (0.0, 0.75, 1.0))
+    small = of_noisy(noisy, (0.0, 0.1, 0.7), (0.0, 0.1, 0.0))
+
+    assert never["tasks_learned"].value == 0 and never["stage_reached"].value == 1
+    assert (never["frames_to_mastery"].value, never["frames_to_mastery"].n_undefined) == (None, 1)
+    assert late["tasks_learned"].value == 1 and late["frames_to_mastery"].value == 200
+    assert late["relative_forgetting"].value == pytest.approx(0.45 / 1.3)
+    assert small["relative_forgetting"].undefined.endswith("and the noise of its rewards")
+
+
+def test_without_shares_or_a_goal_that_pays_mastery_under_noise_is_not_known():
+    noisy = replace(ct_su_b1((1, 1)), reward_std=0.4)
+    unpaid = replace(noisy, goal_reward=-1.0)
+
+    for found in (of_noisy(noisy, (1.0,) * 3, (None,) * 3), of_noisy(unpaid, (1.0,) * 3, (1.0,) * 3)):
+        assert found["tasks_learned"].value is None and "is not known" in found["tasks_learned"].undefined
+        assert found["frames_to_mastery"].n_undefined == 0 and found["frames_to_mastery"].value is None
+
+
+def test_exact_means_have_no_noise():
+    noisy = replace(ct_su_b1((1, 1)), reward_std=0.4)
+
+    assert evaluation_noise(noisy, Evaluation(num_episodes=4)) == 0.2
+    assert evaluation_noise(noisy, Evaluation(exact=True)) == 0.0
 
 
 def test_without_experts_what_needs_them_is_undefined(log):
