@@ -232,9 +232,11 @@ def test_totals_over_all_graphs_are_counted_from_the_raw_results(names):
     for name in (*others, "LSTM"):
         assert f"| {name} | {number(given[name])} | {at_any_evaluation(given[name])} | " in table
     lower = [name for name in others if p_values[name] <= 0.05]
-    alike = named(PAGE.split("is not distinguishable from")[1].split(". The other")[0])
-    assert f"The other {len(lower)} agents have lower returns (p <= 0.05, Holm)" in PAGE
-    assert sorted(alike) == sorted(name for name in others if p_values[name] > 0.05)
+    others_said = re.findall(r"([\w+-]+) (-?[\d.]+) \[", PAGE.split("Their differences: ")[1].split(" - **")[0])
+    differences = {name: each.difference.value for name, each in zip(others, found, strict=True)}
+    assert f"{len(lower)} agents have lower returns than the LSTM (p <= 0.05, Holm)" in PAGE
+    assert {name for name, _ in others_said} == {name for name in others if p_values[name] > 0.05}
+    assert all(float(shown) == pytest.approx(differences[name], abs=0.0051) for name, shown in others_said)
     assert all(sum(paired[name]) < sum(paired["LSTM"]) for name in lower)
     lost = [line for key, of in lines.items() if key[1] == "0" for line in of if line["frames_to_90"]]
     gone = [line for line in lost if float(line["greedy_return"]) < 0.9]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 from math import fsum
 from pathlib import Path
 from statistics import fmean
@@ -10,10 +11,28 @@ from string import Template
 from typing import TYPE_CHECKING, Any
 
 from studies import adaptation_swap
-from studies.raw import HERE, TEMPLATES, Raw, groups, lines_of_runs, machine_of, machines, mean_of, read, table, write
+from studies.raw import (
+    HERE,
+    TEMPLATES,
+    Raw,
+    groups,
+    lines_of_runs,
+    machine_of,
+    machines,
+    mean_of,
+    read,
+    shown,
+    table,
+    write,
+)
+from studies.sentences import Sentences
+from studies.verdicts import seeds_that_would_do
 
 if TYPE_CHECKING:
     from ctgraph_rl.report.intervals import Bounds
+    from ctgraph_rl.report.statistics import Comparison
+
+says = Sentences()
 
 NAME = "adaptation"
 PAGE = HERE / "adaptation.md"
@@ -172,6 +191,128 @@ def gates_table(depth: int) -> str:
     return table(["agent", *(f"`{gate}`" for gate in GATES)], rows)
 
 
+def against(first: tuple[str, str], second: tuple[str, str]) -> Comparison:
+    """Compare the success after adaptation of two agents with their gates at depth 2, on the seeds that both have."""
+    from ctgraph_rl.report import statistics
+
+    found = runs(2)
+    seeds = [seed for seed in found[first] if seed in found[second]]
+    values, others = ([adapted(found[key][seed]) for seed in seeds] for key in (first, second))
+    return statistics.compare(values, others, bounds=SUCCESS)
+
+
+def gate_differences() -> str:
+    """Return a row for each agent and gate: its success after adaptation less that without a gate, by seed."""
+    rows = []
+    for agent, gate in runs(2):
+        if gate != "none":
+            found = against((agent, gate), (agent, "none"))
+            record = f"{found.wins}, {found.ties}, {found.losses}"
+            rows.append(
+                [LABELS[agent], f"`{gate}`", shown(found.difference), record, str(seeds_that_would_do(found) or "-")]
+            )
+    return table(["agent", "gate", "difference", "better, equal, worse", "seeds that would do"], rows)
+
+
+RIVALS = ("cavia", "rl2", "maml")
+"""Agents below PEARL."""
+
+
+def differences() -> dict[str, str]:
+    """Return what the page says of differences of agents and of a gate."""
+    found = {name: against(("pearl", "none"), (name, "none")) for name in RIVALS}
+    gated = against(("pearl", "none"), ("pearl", "hard_straight_through"))
+    return {
+        **{f"pearl_{name}": shown(each.difference) for name, each in found.items()},
+        "order_seeds": str(max(seeds_that_would_do(each) or 0 for each in found.values())),
+        "gate_of_pearl": shown(gated.difference),
+    }
+
+
+def episodes(agent: str, gate: str = "none") -> list[list[float]]:
+    """Return the success of each seed of an agent in each episode of a row, at depth 2."""
+    return [[float(line["success"]) for line in lines] for lines in runs(2)[agent, gate].values()]
+
+
+@says("**PEARL and RL^2 search for the goal from the first episode on.**")
+def _() -> bool:
+    return all(fmean(curve[4:20]) > 0.5 for name in ("pearl", "rl2") for curve in episodes(name))
+
+
+@says("**CAVIA and MAML do not search, and then miss some of the goals.**")
+def _() -> bool:
+    curves = [*episodes("cavia"), *episodes("maml")]
+    return all(abs(fmean(curve[:20]) - 0.25) < 0.05 and fmean(curve[20:]) < 0.8 for curve in curves)
+
+
+@says("**Where decisions look alike only RL^2 exceeds the best policy without memory**")
+def _() -> bool:
+    of_agents = runs(2, SURJECTIVE)
+    above = {(agent, adapted(lines) > WITHOUT_MEMORY) for (agent, _), of in of_agents.items() for lines in of.values()}
+    return above == {("rl2", True), ("cavia", False), ("maml", False), ("pearl", False)}
+
+
+@says("With `hard_straight_through` PEARL ends lower in each of three seeds, by")
+def _() -> bool:
+    return against(("pearl", "none"), ("pearl", "hard_straight_through")).wins == 3
+
+
+@says("**Three seeds cannot say whether a gate helps.**")
+def _() -> bool:
+    gates = [against(key, (key[0], "none")) for key in runs(2) if key[1] != "none"]
+    clear = [each for each in gates if each.p_value is not None and each.p_value <= 0.05]
+    return {each.difference.n for each in gates} == {3} and clear == []
+
+
+@says("One of three soft gates of CAVIA almost never finds the goal.")
+def _() -> bool:
+    return [fmean(curve) < 0.01 for curve in episodes("cavia", "soft")].count(True) == 1
+
+
+@says("**PENN-A is within 0.01 of the best search where the goal is swapped** (one seed).")
+def _() -> bool:
+    [share] = adaptation_swap.shares("penn_a", held_out=True)
+    return abs(adaptation_swap.best_search(4, swapped=True) - share) < 0.01
+
+
+@says("RL^2 always goes to one goal")
+def _() -> bool:
+    lines = [line for line in read("adaptation_swap") if (line["agent"], line["held_out"]) == ("rl2", "False")]
+    reached = {(line["label"], line["success"]) for line in lines}
+    return len(lines) == 12 and [goal for goal, share in reached if share == "1.0"] == ["goal1.1"] and len(reached) == 4
+
+
+@says("**Five seeds cannot order the agents** on the fully observable graph: no p-value of five pairs is below 0.06.")
+def _() -> bool:
+    pairs = [against((one, "none"), (other, "none")) for one, other in combinations(LABELS, 2)]
+    return {each.difference.n for each in pairs} == {5} and min(each.p_value or 0 for each in pairs) > 0.06
+
+
+@says("PEARL ends higher in each of five seeds:")
+def _() -> bool:
+    return all(against(("pearl", "none"), (name, "none")).wins == 5 for name in RIVALS)
+
+
+@says("no interval is on one side of 0:")
+def _() -> bool:
+    gates = [against(key, (key[0], "none")).difference for key in runs(2) if key[1] != "none"]
+    return all(each.low is not None and each.high is not None and each.low < 0 < each.high for each in gates)
+
+
+@says("| agrees, with our settings |")
+def _() -> bool:
+    from ctgraph_rl.report import statistics
+
+    found = statistics.mean(adaptation_swap.shares("rl2", held_out=True), bounds=SUCCESS)
+    return found.high is not None and found.high < adaptation_swap.best_search(4, swapped=True)
+
+
+@says("In three of five seeds the success of RL^2 falls in late episodes.")
+def _() -> bool:
+    lost = [fmean(curve[16:20]) - fmean(curve[-4:]) > 0.1 for curve in episodes("rl2")]
+    return (lost.count(True), len(lost)) == (3, 5)
+
+
 def draw(path: Path) -> None:
     """Draw the success in each episode of a row, without gates: a panel for each graph, a line for each seed."""
     from ctgraph_rl.visualize.style import new_figure, save_figure
@@ -218,8 +359,9 @@ def table_of_graphs(graphs: Sequence[tuple[int, str]]) -> str:
 def page() -> str:
     """Return the page: its template with its tables and numbers."""
     text = (TEMPLATES / "adaptation.md").read_text(encoding="utf-8")
-    return Template(text).substitute(
-        successes(2) | successes(2, SURJECTIVE),
+    made = Template(text).substitute(
+        successes(2) | successes(2, SURJECTIVE) | differences(),
+        gate_differences=gate_differences(),
         gates=gates_table(2),
         without_memory=f"{WITHOUT_MEMORY:.3f}",
         depth_2=adaptation_table(2),
@@ -230,6 +372,7 @@ def page() -> str:
         best_swap=f"{adaptation_swap.best_search(goals=4, swapped=True):.2f}",
         machines=machines(NAME, adaptation_swap.NAME),
     )
+    return says.check(made)
 
 
 def make() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from datetime import date
 from pathlib import Path
+from statistics import fmean
 from string import Template
 from typing import Any, NamedTuple
 
@@ -14,6 +15,10 @@ from ctgraph_rl.board.standings.board_page import write_board
 from ctgraph_rl.board.standings.board_tables import BoardTable
 from ctgraph_rl.board.standings.track_ceilings import Ceilings
 from studies.raw import HERE, TEMPLATES, table
+from studies.sentences import Sentences
+from studies.verdicts import undecided
+
+says = Sentences()
 
 FOLDER = HERE / "board"
 PUBLISHED = date(2026, 11, 23)
@@ -143,14 +148,52 @@ def page(tables: list[BoardTable]) -> str:
     several = [each for each in tables if len(each.standings) > 1]
     alone = [each for each in tables if len(each.standings) == 1]
     template = Template((TEMPLATES / "board.md").read_text(encoding="utf-8"))
-    return template.substitute(
+    text = template.substitute(
         tables="\n\n".join(f"## {each.title}\n\n{_table(each)}" for each in several),
         alone=table(
             ["track and rung", "given", "method", "score", "bytes per task", "landmarks"], list(map(_line, alone))
         ),
         count=sum(len(each.standings) for each in tables),
         without=_without({each.track.name for each in tables}),
+        clearest=_clearest(tables[0]),
     )
+    return says.check(text, tables)
+
+
+def _clearest(of: BoardTable) -> str:
+    """Return the clearest difference of two lines of the first ranks, whose order is open."""
+    names = {line.name for line in of.standings if line.best_rank == 1}
+    found = {pair: each for pair, each in of.pairs.items() if names.issuperset(pair)}
+    one, other = min(found, key=lambda pair: found[pair].p_value or 0)
+    return f"{one} less {other}, {undecided(found[one, other], len(of.pairs))}"
+
+
+def _ranks(of: BoardTable) -> dict[str, set[str]]:
+    """Return the names of lines by their rank."""
+    found: dict[str, set[str]] = {}
+    for line in of.standings:
+        found.setdefault(line.rank, set()).add(line.name)
+    return found
+
+
+@says("Ten keep nearly everything. 20 seeds cannot order them:")
+def _(tables: list[BoardTable]) -> bool:
+    first = [line for line in tables[0].standings if line.rank == "1 to 10"]
+    forgotten = [fmean(line.entry.values["forgetting"]) for line in first]
+    return tables[0].num_seeds == 20 and len(first) == 10 and max(forgotten) < 0.05
+
+
+@says("CLEAR are behind them, then CKA-RL and agents without a method.")
+def _(tables: list[BoardTable]) -> bool:
+    last = {"PPO + CKA-RL", "LSTM-PPO", "PPO with a count-based bonus", "REINFORCE", "A2C", "PPO"}
+    ranks = _ranks(tables[0])
+    return ranks.get("11 to 12") == {"PPO + MaskSC", "PPO + CLEAR"} and ranks.get("13 to 18") == last
+
+
+@says("MaskSC, which forgets nothing but does not learn every task,")
+def _(tables: list[BoardTable]) -> bool:
+    [line] = [line for line in tables[0].standings if line.name == "PPO + MaskSC"]
+    return set(line.entry.values["forgetting"]) == {0.0} and fmean(line.entry.scores) < 0.95
 
 
 def _without(there: set[str]) -> str:

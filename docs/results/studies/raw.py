@@ -6,6 +6,7 @@ import csv
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,6 +39,12 @@ def read(name: str, folder: Path | None = None) -> Raw:
     path = (folder or HERE) / f"{name}.csv"
     if not path.exists():
         return []
+    return [dict(line) for line in _lines(path, path.stat().st_mtime_ns)]
+
+
+@lru_cache(maxsize=8)
+def _lines(path: Path, changed: int) -> Raw:
+    """Return the lines of a file, which are read again where it has changed."""
     with open(path, newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
+from typing import Any
 
 import torch
 
@@ -60,17 +61,27 @@ class Table:
         """The mean return of each method over all blocks."""
         return {method: self.areas(method).mean().item() for method in METHODS}
 
+    def compare_areas(self) -> dict[tuple[str, str], statistics.Comparison]:
+        """All pairs of methods by the mean return over all blocks, their p-values corrected for all of them."""
+        of = {method: self.areas(method).mean(1).tolist() for method in METHODS}
+        pairs = combinations(METHODS, 2)
+        return statistics.corrected({(a, b): statistics.compare(of[a], of[b], bounds=(0, 1)) for a, b in pairs})
+
     def pairs_of_areas(self) -> dict[tuple[str, str], float | None]:
-        """The p-values of all pairs of methods by the mean return over all blocks, corrected for all of them."""
-        of = {method: self.areas(method).mean(1) for method in METHODS}
-        pairs = list(combinations(METHODS, 2))
-        corrected = statistics.holm([self.p_value(of[one], of[other]) for one, other in pairs])
-        return dict(zip(pairs, corrected, strict=True))
+        """The corrected p-values of all pairs of methods by the mean return over all blocks."""
+        return {pair: found.holm for pair, found in self.compare_areas().items()}
 
     @staticmethod
     def p_value(first: torch.Tensor, second: torch.Tensor) -> float | None:
         """The p-value of the paired test of two methods, a number for each seed."""
         return statistics.compare(first.tolist(), second.tolist()).p_value
+
+
+def clearest(found: Mapping[Any, statistics.Comparison]) -> tuple[Any, statistics.Comparison]:
+    """The comparison with the smallest p-value of those that are not found: above 0.05 after the correction."""
+    left = {pair: each for pair, each in found.items() if each.holm is not None and each.holm > 0.05}
+    pair = min(left, key=lambda pair: left[pair].p_value or 1.0)
+    return pair, left[pair]
 
 
 class ByAgent:
@@ -97,6 +108,12 @@ class ByAgent:
     def against_finetuning(self, agents: Sequence[str]) -> dict[str, statistics.Comparison]:
         """Each method against fine-tuning with some agents on each curriculum."""
         return pairs.against_finetuning(agents)
+
+    def last_depth(self, methods: Sequence[str]) -> dict[str, statistics.Comparison]:
+        """PPO with each method less fine-tuned PPO by depth 5 in its own block, p-values corrected for all."""
+        of = {name: self.own("depth2to5", name, "ppo")[:, 3].double().tolist() for name in (*methods, "finetune")}
+        found = {name: statistics.compare(of[name], of["finetune"], bounds=(0, 1)) for name in methods}
+        return statistics.corrected(found)
 
     def keeps_and_finds(self, methods: Sequence[str]) -> tuple[bool, list[int]]:
         """Whether PPO with each method keeps all depths that it learned, and in how many seeds it learns the last."""

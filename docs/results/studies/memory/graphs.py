@@ -20,6 +20,7 @@ from studies.memory.conditions import (
 )
 from studies.memory.runs import AGENTS, count, mean, returns, solved, solved_once
 from studies.raw import Raw, interval_of, shown, table
+from studies.verdicts import ALPHA, undecided
 
 if TYPE_CHECKING:
     from ctgraph_rl.report.statistics import Comparison
@@ -65,14 +66,13 @@ def totals() -> dict[str, Raw]:
     return {name: [line for of in each for line in of[name]] for name in AGENTS if all(name in of for of in each)}
 
 
-def compared(of: Mapping[str, Raw]) -> dict[str, tuple[Comparison, float]]:
-    """Return the paired comparison of each agent's greedy returns with the LSTM's, and its p-value after Holm."""
+def compared(of: Mapping[str, Raw]) -> dict[str, Comparison]:
+    """Return the paired comparison of each agent's greedy returns with the LSTM's, p-values corrected for all."""
     from ctgraph_rl.report import statistics
 
-    base, others = returns(of["lstm_ppo"]), [name for name in of if name != "lstm_ppo"]
-    found = [statistics.compare(returns(of[name]), base, bounds=(0, 1)) for name in others]
-    corrected = statistics.holm([each.p_value for each in found])
-    return {name: (each, p) for name, each, p in zip(others, found, corrected, strict=True) if p is not None}
+    base = returns(of["lstm_ppo"])
+    found = {name: statistics.compare(returns(of[name]), base, bounds=(0, 1)) for name in of if name != "lstm_ppo"}
+    return statistics.corrected(found)
 
 
 def total_table() -> str:
@@ -88,8 +88,8 @@ def total_table() -> str:
             f"{mean(lines, 'greedy_return'):.2f}",
         ]
         if name in comparisons:
-            comparison, p = comparisons[name]
-            row += [shown(comparison.difference), f"{p:.3f}"]
+            comparison = comparisons[name]
+            row += [shown(comparison.difference), f"{comparison.holm:.3f}"]
         rows.append([*row, "", ""][:6])
     number = len(next(iter(of.values())))
     heads = [
@@ -102,19 +102,24 @@ def total_table() -> str:
     return table(["", *heads], rows)
 
 
-def distinguishable() -> tuple[str, str]:
-    """Return how many agents have lower returns than the LSTM, p <= 0.05 after Holm, and those not distinguishable.
+def lower_and_undecided() -> tuple[str, str]:
+    """Return how many agents have lower returns than the LSTM, p <= 0.05 after Holm, and the others' differences.
 
     Raises:
         ValueError: for an agent with higher returns, of which the page has no word.
     """
+
     lower: list[str] = []
-    alike: list[str] = []
-    for name, (comparison, p) in compared(totals()).items():
-        if p <= 0.05 and (comparison.difference.value or 0) > 0:
+    others: list[str] = []
+    found = compared(totals())
+    for name, comparison in found.items():
+        if (comparison.holm or 0) > ALPHA:
+            others.append(f"{AGENTS[name]} {undecided(comparison, len(found))}")
+        elif (comparison.difference.value or 0) > 0:
             raise ValueError(f"{name} has higher returns than the LSTM: the page says otherwise")
-        (lower if p <= 0.05 else alike).append(AGENTS[name])
-    return str(len(lower)), listed(alike)
+        else:
+            lower.append(AGENTS[name])
+    return str(len(lower)), "; ".join(others)
 
 
 def lost() -> str:

@@ -69,7 +69,7 @@ def texts() -> dict[str, str]:
             on_unique = of[UNIQUE._replace(wait_prob=wait_prob, num_wait_images=images)]
             for place, name in LENGTHS.items():
                 found[f"{place}{middle}{end}"] = count(on_unique.get(name))
-    found["lower"], found["alike"] = graphs.distinguishable()
+    found["lower"], found["undecided"] = graphs.lower_and_undecided()
     found |= {"lost": graphs.lost(), "with_noise": graphs.with_noise()}
     found |= {"solve_shared": graphs.better_than_poor(SHARED), "solve_unique": graphs.better_than_poor(UNIQUE)}
     return found | ladder.texts() | {"intervals": graphs.intervals(), "published": published.text()}

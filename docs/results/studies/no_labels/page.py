@@ -5,11 +5,13 @@ from __future__ import annotations
 from statistics import mean
 from string import Template
 
+from ctgraph_rl.report.statistics import Comparison
 from studies.lifelong.pairs import of_pairs, rows
 from studies.no_labels import figures, task_free
 from studies.no_labels.learners import LEARNERS, finished, values
 from studies.no_labels.runs import FOUND, IMAGES, MASKS, NAME, PLANNED, SPANS
 from studies.raw import HERE, TEMPLATES, Raw, groups, machines, mean_of, read, table
+from studies.verdicts import undecided
 
 PAGE = HERE / "no_labels.md"
 SOON = 65_536
@@ -106,8 +108,8 @@ def on_images(name: str) -> Raw:
     return [line for place in IMAGES for line in finished().get((place, "204800"), {}).get(name, [])]
 
 
-def compared() -> str:
-    """Return the table of comparisons on the image sets, whose pairs are those of all configurations together."""
+def comparisons() -> dict[tuple[str, str], Comparison]:
+    """Return the comparisons on the image sets, whose pairs are those of all configurations together."""
     measured: dict[tuple[str, ...], float] = {
         (name, place, line["seed"]): float(line["average_performance"])
         for (place, _), each in finished().items()
@@ -116,10 +118,15 @@ def compared() -> str:
         for line in lines
     }
     names = {name for name, *_ in measured}
-    wanted = [(a, b) for a, b in COMPARED if {a, b} <= names]
-    if not wanted:
+    return {(a, b): of_pairs(measured, a, b) for a, b in COMPARED if {a, b} <= names}
+
+
+def compared() -> str:
+    """Return the table of comparisons on the image sets."""
+    found = comparisons()
+    if not found:
         return "No two learners have all their seeds yet."
-    return rows({f"{LEARNERS[a]} - {LEARNERS[b]}": of_pairs(measured, a, b) for a, b in wanted})
+    return rows({f"{LEARNERS[a]} - {LEARNERS[b]}": each for (a, b), each in found.items()})
 
 
 COMPARED = (
@@ -149,8 +156,7 @@ def numbers() -> dict[str, str]:
     names = {"swoks_online": "swoks, fresh", "adwin_online": "adwin", "oracle_online": "oracle"}
     online = {key: f"{mean(values(on_images(name), 'online_return')):.2f}" for key, name in names.items()}
     found = {key.replace("online", "found"): str(soon(on_images(name))) for key, name in names.items()}
-    ends = {name: mean(values(on_images(name), "average_performance")) for name in ("announced", "oracle")}
-    return {**online, **found, "announced_less": f"{ends['announced'] - ends['oracle']:.2f}"}
+    return {**online, **found, "announced_less": undecided(comparisons()["announced", "oracle"])}
 
 
 def page() -> str:

@@ -1,0 +1,57 @@
+"""What pages of results conclude is computed from raw results: of opposite ones it is not said."""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+import pytest
+from helpers.opposite import Table, empty, mirror, shuffle, write_changed
+from studies import raw
+from studies.sentences import Sentences
+
+TABLES = {
+    "studies.adaptation": [
+        Table("adaptation", ("success",), ("agent", "gate")),
+        Table("adaptation_swap", ("success",), ("agent",)),
+    ],
+}
+
+
+def not_said(sentences: Sentences) -> set[str]:
+    """The sentences that raw results do not say."""
+    found = set()
+    for sentence, holds in sentences.of.items():
+        try:
+            if not holds():
+                found.add(sentence)
+        except (ArithmeticError, LookupError, ValueError):
+            found.add(sentence)
+    return found
+
+
+@pytest.mark.parametrize("page", TABLES)
+def test_what_a_page_concludes_is_not_said_of_opposite_or_empty_results(page, tmp_path, monkeypatch):
+    says = import_module(page).says
+    found = {}
+    for change in (mirror, shuffle, empty):
+        write_changed(TABLES[page], change, tmp_path / change.__name__)
+        with monkeypatch.context() as patch:
+            patch.setattr(raw, "HERE", tmp_path / change.__name__)
+            found[change] = not_said(says)
+
+    assert not_said(says) == set()
+    assert found[mirror] | found[shuffle] == set(says.of)
+    assert found[empty] == set(says.of)
+
+
+def test_a_page_is_refused_that_lacks_a_sentence_or_says_one_that_does_not_hold():
+    says = Sentences()
+    holds = [True]
+    says("The sun rises.")(lambda: holds[0])
+
+    assert says.check("**In short**\n\nThe sun\nrises. The end.").endswith("The end.")
+    with pytest.raises(ValueError, match=r"the page lacks the sentence 'The sun rises\.'"):
+        says.check("The sun sets.")
+    holds[0] = False
+    with pytest.raises(ValueError, match=r"raw results do not say 'The sun rises\.'"):
+        says.check("The sun rises.")
