@@ -57,7 +57,7 @@ def optimal_performance(best: Tensor) -> Tensor:
     "mean over tasks with m_j < best_j of (R[last,j] - m_j) / (best_j - m_j)",
     HERE,
     partial=True,
-    missing="memory gains nothing there",
+    missing="memory gains nothing there, or an evaluation is missing",
     bounds=at_most_1,
 )
 def memory_gap_closed(performance: Tensor, memoryless_ceilings: Tensor, best: Tensor) -> Tensor:
