@@ -347,6 +347,7 @@ def _labelling(log: RunLog, curriculum: Curriculum) -> Labelling | Undefined:
         alarm=log.training("alarm") > 0,
         rolled_back=log.training("rolled_back").nan_to_num().long(),
         announced=curriculum.protocol.boundaries == "announced",
+        oracle=bool((log.training("oracle") > 0).any()),
     )
 
 

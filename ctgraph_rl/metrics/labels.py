@@ -37,6 +37,7 @@ class Labelling(NamedTuple):
     alarm: Tensor  # bool: whether there is an alarm at the end of the interval
     rolled_back: Tensor  # int64: earlier frames whose learning was undone there
     announced: bool = False  # whether changes were announced
+    oracle: bool = False  # whether the detector knows the true tasks
 
     def check_one_task_each(self) -> None:
         """Leave the metric undefined where an interval has several tasks."""
@@ -51,7 +52,7 @@ class Labelling(NamedTuple):
 
 @defined(
     "ctgraph_rl/detection-delay",
-    "mean over detected changes c of (frames at the first alarm from c to the next change) - (frames at c)",
+    "mean over detected changes c of (frames at the first alarm after c, up to the next change) - (frames at c)",
     HERE,
     partial=True,
     missing="no alarm before the next change",
@@ -59,11 +60,11 @@ class Labelling(NamedTuple):
     is_time=True,
 )
 def detection_delay(labelling: Labelling) -> Tensor:
-    """Return the frames from each change of task to the first alarm, before the next change; NaN for a missed one.
+    """Return the frames from each change of task to the first alarm that can be due to it; NaN for a missed one.
 
-    Changes that were missed are left out of the mean, and counted. Alarms are at ends of batches. An alarm at the frame
-    of the change counts with delay 0. The oracle detects so by design; any other detector has seen only frames of the
-    old task then, and its detection is a coincidence.
+    Changes that were missed are left out of the mean, and counted. Alarms are at ends of batches. Those count whose
+    batch has frames of the new task, up to the batch that ends at the next change. An alarm right at the change has
+    seen only frames of the old task: it counts, with delay 0, for the oracle, which knows the task of the next batch.
     """
     return _delays(labelling)
 
@@ -182,12 +183,17 @@ def _pairs(number: int) -> int:
 
 
 def _delays(labelling: Labelling) -> Tensor:
-    """Return the frames from each change to the first alarm before the next one, float64 [changes]; NaN without."""
+    """Return the frames from each change to the first alarm that counts for it, float64 [changes]; NaN without."""
     labelling.check_hidden()
     labelling.check_one_task_each()
     ends = labelling.frames.cumsum(0)
     changes = ends[:-1][labelling.task[1:] != labelling.task[:-1]].tolist()
     alarms = ends[labelling.alarm].tolist()
-    spans = pairwise([*changes, math.inf])
-    delays = [next((alarm - start for alarm in alarms if start <= alarm < stop), math.nan) for start, stop in spans]
+    delays = []
+    for start, stop in pairwise([*changes, math.inf]):
+        if labelling.oracle:
+            own = [alarm for alarm in alarms if start <= alarm < stop]
+        else:
+            own = [alarm for alarm in alarms if start < alarm <= stop]
+        delays.append(own[0] - start if own else math.nan)
     return float64(delays)

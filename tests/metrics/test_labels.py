@@ -95,15 +95,36 @@ def test_the_adjusted_rand_index_has_published_values_and_is_exact_for_many_fram
     assert adjusted_rand_index(*given) == value
 
 
-def test_an_alarm_counts_for_the_change_before_it_and_once():
-    log = log_of(
-        *((1, 400, 1, 1, 1, 0), (2, 600, 2, 1, 0, 0), (2, 700, 1, 1, 1, 0)), (2, 800, 1, 1, 1, 0), (3, 1200, 1, 1, 0, 0)
-    )
+AT_CHANGES = (
+    *((1, 400, 1, 1, 1, 0), (2, 600, 2, 1, 0, 0), (2, 700, 1, 1, 0, 0)),
+    *((2, 800, 1, 1, 1, 0), (3, 1200, 1, 1, 0, 0)),
+)
+"""Alarms at 400 and 800 frames, right at the changes."""
+
+
+def test_an_alarm_counts_for_the_last_change_of_whose_task_its_batch_has_frames():
+    metrics = found(log_of(*AT_CHANGES))
+
+    assert metrics["detection_delay"].terms == (400.0, None)
+    assert metrics["false_alarms"].value == pytest.approx(100_000 / 1200)  # that of 400 frames
+
+
+def test_a_second_alarm_after_a_change_is_a_false_one():
+    metrics = found(log_of((1, 400, 1, 1, 0, 0), (2, 600, 1, 1, 1, 0), (2, 800, 1, 1, 1, 0), (3, 1200, 1, 1, 0, 0)))
+
+    assert metrics["detection_delay"].terms == (200.0, None)
+    assert metrics["false_alarms"].value == pytest.approx(100_000 / 1200)
+
+
+def test_the_oracle_is_right_at_the_change():
+    log = log_of(*AT_CHANGES)
+    for m in log.of_kind("training"):
+        m["oracle"] = 1
 
     metrics = found(log)
 
-    assert metrics["detection_delay"].terms == (0.0, 0.0)  # those of 400 and 800 frames, right at the changes
-    assert metrics["false_alarms"].value == pytest.approx(100_000 / 1200)
+    assert metrics["detection_delay"].terms == (0.0, 0.0)
+    assert metrics["false_alarms"].value == 0
 
 
 @pytest.mark.parametrize(

@@ -210,10 +210,12 @@ class SelfLabelledAgent(nn.Module):
         Returns:
             What the agent measured, if it learned; ``acted_label``, from 1, that acted in the batch; ``learned``, 1 or
             0; ``alarm``, 1 where the detector left the label that was learned, or 0; ``rolled_back``, the number of
-            earlier frames whose learning was undone.
+            earlier frames whose learning was undone; ``oracle``, 1, where the detector knows the true tasks.
         """
         verdict = self.detector.observe(self._seen(batch))
         measured: dict[str, float] = {"acted_label": self.label + 1, "learned": 0, "alarm": 0, "rolled_back": 0}
+        if self.detector.is_oracle:
+            measured["oracle"] = 1
         if self.home is not None:
             self.num_tried += batch.numel()
             if isinstance(verdict, int):

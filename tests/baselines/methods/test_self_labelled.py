@@ -102,7 +102,7 @@ def lines(log: RunLog, *without: str) -> list[dict[str, Any]]:
     return [{key: value for key, value in m.items() if key not in ("seconds", *without)} for m in log.measurements]
 
 
-OWN = ("acted_label", "learned", "alarm", "rolled_back")
+OWN = ("acted_label", "learned", "alarm", "rolled_back", "oracle")
 """Measurements that an agent with labels adds."""
 
 

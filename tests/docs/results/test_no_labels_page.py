@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from itertools import pairwise
+from math import exp
 
 import pytest
 import torch
@@ -37,7 +38,7 @@ def labelling(spans, num_tasks):
             rows.append(
                 (int(span["label"]), first // stay % num_tasks, last - first, span["learned"] == "True", alarm, 0)
             )
-    return Labelling(*map(torch.tensor, zip(*rows, strict=True)))
+    return Labelling(*map(torch.tensor, zip(*rows, strict=True)), oracle=spans[0]["detector"] == "oracle")
 
 
 @pytest.mark.slow
@@ -121,7 +122,12 @@ def test_found_changes_and_other_alarms_are_counted_from_the_spans(made, masks):
     assert "All its 16 other alarms are false, and came while the return was at least 0.9" in PAGE
     assert sorted(line["labels_per_task"] for line in adwin) == ["1.0"] * 4 + ["1.25"]
     soon = " or ".join(str(made.soon(masks[name])) for name in ("swoks", "swoks, fresh"))
-    assert f"SWOKS finds {soon} of 35 changes within 65,536 frames" in PAGE
+    chance = [1 - exp(-len(others[name]) / (5 * 8 * 384_000) * 65_536) for name in ("swoks", "swoks, fresh")]
+    said = " or ".join(f"{100 * each:.0f} %" for each in chance)
+    assert f"SWOKS finds {soon} of 35 changes within 65,536 frames: its other alarms would find {said} by" in PAGE
+    for name, share in zip(("swoks", "swoks, fresh"), chance, strict=True):
+        assert made.soon(masks[name]) / 35 > 2 * share
+        assert f"| {made.soon(masks[name])} of 35; {100 * share:.0f} % |" in PAGE
     number = {name: len(returns) for name, returns in others.items()}
     both = [of["swoks"] + of["swoks, fresh"] for of in (number, false, high)]
     said = f"Of its {both[0]} other alarms {both[1]} are false and {both[0] - both[1]} late, and {both[2]} come while"
@@ -206,6 +212,10 @@ def test_what_is_said_of_ewc_on_new_images_is_what_the_pairs_show(made):
     assert all(0.22 < share < 0.28 for share in shares) and "about a quarter of the frames is not learned" in PAGE
     found = [made.soon(lines) for lines in runs.values()]
     assert f"SWOKS finds {found[0]} of 60 soon, ADWIN {found[1]}." in PAGE and found[2] == 60
+    chance = [1 - exp(-len(made.alarms(runs[name])) / (20 * 819_200) * 65_536) for name in ("swoks, fresh", "adwin")]
+    said = " and ".join(f"{100 * each:.0f} %" for each in chance)
+    assert f"By chance their other alarms would find {said}." in PAGE
+    assert all(number / 60 > 2 * share for number, share in zip(found, chance, strict=False))
     swoks, adwin, oracle = (value(lines, "online_return") for lines in runs.values())
     assert f"the online return is {swoks} (SWOKS) and {adwin} (ADWIN), with the oracle {oracle}." in PAGE
     assert {line["label_agreement"] for line in runs["oracle"]} == {"1.0"}
