@@ -103,7 +103,6 @@ def lines(log: RunLog, *without: str) -> list[dict[str, Any]]:
 
 
 OWN = ("acted_label", "learned", "alarm", "rolled_back")
-OWN = ("acted_label", "learned", "alarm", "rolled_back", "oracle")
 """Measurements that an agent with labels adds."""
 
 
