@@ -61,7 +61,7 @@ def from_axes(
     reward_std: float = 0.0,
     reward_fn: str = "needle",
 ) -> Curriculum:
-    """Tasks that differ in goal, images, depth and wait probability, in a chosen order.
+    """Any combination of axes; the paper's Table 3 has the names in brackets.
 
     Lists are combined: the goals vary fastest, then depths, then wait probabilities, then image seeds. All tasks share
     rewards and the rules of what is observed. The ``protocol`` and ``evaluation`` of a run say what the learner knows
@@ -69,40 +69,38 @@ def from_axes(
 
     Args:
         configuration: where the rest comes from: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
-        branching_factor: another b, or several for ``random_graphs``; None: as configured.
-        depth: another d, or several: then all have the ids of the deepest graph. None: as configured.
-        wait_prob: another p, or several; None: as configured.
-        image_seeds: seed of the image set, or several.
-        goals: ``all``; ``random``, ``num_goals`` of each graph; ``nested``, one random goal of the deepest graph and
-            its beginnings at the other depths; or a list of goals, each for the graphs of its depth.
-        num_goals: for ``random``.
-        order: ``product``; ``interleave``, where image seeds take turns, or the graphs if there is one seed;
-            ``shuffle`` from the seed; or ``reverse``, the product from its end.
+        branching_factor: another b, or several for ``random_graphs``; None: as configured [b].
+        depth: another d, or several: then all have the ids of the deepest graph; None: as configured [d].
+        wait_prob: another p, or several; None: as configured [p].
+        image_seeds: seed of the image set, or several [image set: seed].
+        goals: ``all``; ``random``, ``num_goals`` a graph; ``nested``, a random path and its beginnings; or a list of
+            goals such as [[1,2],[2,1]], each for the graphs of its depth.
+        num_goals: how many random goals.
+        order: ``product``; ``interleave``, image seeds take turns, or graphs if there is one seed; ``shuffle``, by
+            ``seed``; or ``reverse``.
         repeats: how often the whole sequence comes.
         seed: draws random goals and the shuffled order.
         num_frames: frames per block, or a list with those of each.
-        switch: None: a block for each task. Else one block with all tasks, between which each row changes: in turns of
-            ``switch_episodes`` (``by_episode``), with probability 1 / ``switch_episodes`` (``at_random``), or by
-            drifting from each task to the next in that many episodes (``drift``).
-        switch_episodes: for ``switch``.
-        name: of the curriculum.
-        read_noise: largest addition to each pixel whenever an image is read, in 0..255.
-        read_rotation: largest rotation whenever an image is read, in whole degrees in 0..359.
-        random_graphs: how many tasks to draw from ``seed``, each with one of the branching factors, depths, wait
-            probabilities and image seeds, and any goal. None: all combinations.
-        unique_decisions: each decision state has its own image, MDP_D of the paper; None: as configured.
-        unique_waits: each wait state has its own image, MDP_W; None: as configured.
-        decision_ids: first and last id of decision states, D_IDs; None: the next free ids.
-        wait_ids: first and last id of wait states, W_IDs; None: the configured ones where wait states draw one of
-            several, else the next free ids.
-        num_images: length of the image set, nr_images; None: as many as there are ids.
-        image_size: r, the side of an image in pixels, a multiple of 4.
-        one_hot: vectors instead of images, 1D.
-        goal_reward: reward at the goal, high_r.
-        fail_reward: reward at the fail state, fail_r.
-        step_reward: reward of every step, in addition.
-        reward_std: standard deviation of the noise on the reward of end states, std_r.
-        reward_fn: g: ``needle`` pays at the goal, ``gradient`` also at other end states, the more the nearer.
+        switch: None: a block for each task; else all tasks in one block, between which each row changes: in turns,
+            ``by_episode``; ``at_random``; or by ``drift`` from each task to the next.
+        switch_episodes: episodes between changes, in turns, in the mean, or of a drift.
+        name: of the curriculum, in logs and tables.
+        read_noise: largest addition to each pixel whenever an image is read, in 0..255 [noise on read].
+        read_rotation: largest rotation whenever an image is read, whole degrees in 0..359 [rotation on read].
+        random_graphs: how many tasks to draw by ``seed``, each with any of the shapes, images and goals; None: all
+            combinations.
+        unique_decisions: whether each decision state has its own image; None: as configured [MDP_D].
+        unique_waits: whether each wait state has its own image; None: as configured [MDP_W].
+        decision_ids: first and last id of decision states, such as [2,2]; None: the next free ids [D_IDs].
+        wait_ids: first and last id of wait states; None: as configured where they draw, else the next free [W_IDs].
+        num_images: length of the image set; None: as many as there are ids [nr_images].
+        image_size: side of an image in pixels, a multiple of 4 [r of section 2].
+        one_hot: vectors instead of images [1D].
+        goal_reward: reward at the goal [high_r].
+        fail_reward: reward at the fail state [fail_r].
+        step_reward: reward of every step, in addition [section 2.5].
+        reward_std: standard deviation of the noise on the reward of end states [std_r].
+        reward_fn: what end states pay: ``needle``, only the goal; ``gradient``, the nearer the goal the more [g].
 
     Raises:
         ValueError: for values out of range; lists the choices.

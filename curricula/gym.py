@@ -58,7 +58,7 @@ def frozen_lake_4maps(num_frames: int = 20_480) -> Curriculum:
     """Gymnasium's FrozenLake: two maps, each first without and then with slippery ice; the optimum is known.
 
     Args:
-        num_frames: of each of the four blocks.
+        num_frames: frames of each of the four blocks.
     """
     tasks = [
         GymTask(
@@ -76,7 +76,7 @@ def cartpole_3lengths(num_frames: int = 51_200) -> Curriculum:
     """Gymnasium's CartPole with poles of three lengths; an episode ends after 200 steps at the latest.
 
     Args:
-        num_frames: of each of the three blocks.
+        num_frames: frames of each of the three blocks.
     """
     tasks = [
         GymTask(f"curricula.gym:{POLE}", {"half_length": length}, label=f"length{length:g}", return_range=(1.0, 200.0))
@@ -89,7 +89,7 @@ def minigrid_3tasks(num_frames: int = 102_400) -> Curriculum:
     """Three tasks of MiniGrid from its images of 7 x 7 fields; needs the extra ``minigrid``.
 
     Args:
-        num_frames: of each of the three blocks.
+        num_frames: frames of each of the three blocks.
 
     Raises:
         ValueError: if MiniGrid is not installed.

@@ -55,7 +55,7 @@ def single_task(depth: int = 2, num_frames: int = 102_400) -> Curriculum:
     """A single task, the second goal of CT8 multi-depth at a depth, without a task id: how far plain exploration goes.
 
     Args:
-        depth: d; 0, ..., 0, 1 is the goal.
+        depth: d; the goal is 1, ..., 1, 2.
         num_frames: frames, as the single-task experts had.
     """
     require((is_int(depth, 1, MOST_DEPTH), f"depth must be an integer in 1..{MOST_DEPTH}, got {depth!r}"))

@@ -251,10 +251,10 @@ def random_graphs(
     Args:
         num_frames: frames per task.
         image_seed: seed of the image set that all tasks share.
-        num_tasks: n.
+        num_tasks: how many graphs, n.
         seed: draws the graphs, an integer >= 0.
-        held_out: the number of graphs that a first block leaves out, from 0 to n - 1. That block trains all others,
-            which take turns by episode. Then each held-out graph has its block. 0: each graph has its block.
+        held_out: graphs, fewer than n, that have a block each after one block of all others, which take turns by
+            episode; 0: each graph has its block.
     """
     tasks = axes.random_tasks(num_tasks, seed, kinds=("surjective",), image_seeds=(image_seed,))
     curriculum = _curriculum("random_graphs", tasks, num_frames)

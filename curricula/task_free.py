@@ -36,10 +36,12 @@ LONGEST_EPISODE = 7
 def task_free_abrupt(num_frames: int = 102_400, differ: str = "goals", image_seed: int = 1) -> Curriculum:
     """Four tasks, one after the other, without notice: changes are abrupt, at known frames.
 
+    They differ in ``goals``, the four of the graph behind the same images; in ``inputs``, four image sets and one goal;
+    or in ``both``, an image set for each goal.
+
     Args:
         num_frames: frames per task.
-        differ: ``goals``, the four of the graph behind the same images; ``inputs``, four image sets and one goal;
-            ``both``, an image set for each goal.
+        differ: what changes: ``goals``, ``inputs`` (images) or ``both``.
         image_seed: seed of the first image set; further ones have the next seeds.
     """
     return _curriculum("task_free_abrupt", _tasks(differ, image_seed), num_frames)
@@ -55,8 +57,8 @@ def task_free_gradual(
 
     Args:
         num_frames: frames of each stay, and of each change.
-        differ: see `task_free_abrupt`.
-        image_seed: see `task_free_abrupt`.
+        differ: what changes: ``goals``, ``inputs`` (images) or ``both``.
+        image_seed: seed of the first image set; further ones have the next seeds.
         num_rows: environments of the agent, for the number of episodes of a change.
     """
     require(*at_least_one(num_frames=num_frames, num_rows=num_rows))
@@ -73,8 +75,8 @@ def task_free_recurring(num_frames: int = 102_400, differ: str = "goals", image_
 
     Args:
         num_frames: frames per stay.
-        differ: see `task_free_abrupt`.
-        image_seed: see `task_free_abrupt`.
+        differ: what changes: ``goals``, ``inputs`` (images) or ``both``.
+        image_seed: seed of the first image set; further ones have the next seeds.
     """
     tasks = _tasks(differ, image_seed)
     return _curriculum("task_free_recurring", [tasks[place] for order in ROUNDS for place in order], num_frames)
