@@ -19,9 +19,7 @@ from torchrl.data import Composite, TensorSpec
 from baselines.parts.networks import GROUP, Data, Items, RecurrentModule, TensorsByName, num_actions_of, recurrent
 from baselines.ppo import PPO
 from ctgraph_rl.checks import at_least_one, require
-
-GOAL = 3
-"""The ``outcome`` of an episode that reached the goal."""
+from ctgraph_rl.core.dynamics import OUTCOME_GOAL
 
 OWN_KEYS = ("trial", "previous_action", "reward")
 """The state beside the LSTM's: the number of the episode in its trial, and the last action and reward."""
@@ -137,7 +135,7 @@ class RL2(PPO):
         """
         losses = super().learn(batch) if batch.shape[1] > 1 else {}
         ends = batch["next"][batch["next", "done"].squeeze(-1)]
-        found = (ends["outcome"] == GOAL).float()
+        found = (ends["outcome"] == OUTCOME_GOAL).float()
         for name, number in (("first", 1), ("last", self.trial_episodes)):
             episodes = found[ends["trial"] == number]
             if len(episodes):

@@ -164,10 +164,10 @@ def contenders(agents: list[str]) -> Iterator[Contender]:
         task = TASKS[label]
         yield Contender(name, label, "ours", partial(Ours, name, task))
         if find_spec("sb3_contrib"):
-            from benchmarks.stable import Stable, ways  # needs Stable-Baselines3, which is optional
+            from benchmarks import stable  # needs Stable-Baselines3, which is optional
 
-            for who, way in ways().items():
-                yield Contender(name, label, who, partial(Stable, name, settings(name), task, way))
+            for who, way in stable.ways().items():
+                yield Contender(name, label, who, partial(stable.Stable, name, settings(name), task, way))
 
 
 def cells(names: list[str]) -> Iterator[Contender]:

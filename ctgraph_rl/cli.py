@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
@@ -12,7 +13,7 @@ from ctgraph_rl import __version__, parsers
 from ctgraph_rl.checks import nearest
 from ctgraph_rl.log.escape import terminal_lines
 from ctgraph_rl.log.refuse import quiet_where_nobody_reads
-from ctgraph_rl.packages import command, conf_dir
+from ctgraph_rl.packages import check_packages, conf_dir, first_imports
 
 
 class Command(NamedTuple):
@@ -107,6 +108,18 @@ def _call() -> None:
         sys.exit(2)
     else:
         _start(RUN)
+
+
+def command(module: str) -> Callable[[], None]:
+    """Return the ``main`` of a module of this package, of `curricula` or of `baselines`.
+
+    Raises:
+        ValueError: see `check_packages`.
+    """
+    if not module.startswith("ctgraph_rl."):
+        check_packages()
+    with first_imports():
+        return import_module(module).main
 
 
 def _start(module: str) -> None:

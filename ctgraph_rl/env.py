@@ -21,6 +21,8 @@ from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import NO_LEAF, RowState, Shown
 from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.core.tree import Swap, is_done
+from ctgraph_rl.tasks.kinds.gym_task import GymTask
+from ctgraph_rl.tasks.kinds.registry import ENVIRONMENTS
 from ctgraph_rl.tasks.switch import Switch
 from ctgraph_rl.tasks.task import Task
 
@@ -409,3 +411,13 @@ _SHARED = ("terminated", "step_count", "episode_reward", "reward", "task_id")
 def _own(data: RowData) -> RowData:
     """Return data that may be written into: their memory is their own."""
     return {key: value.clone() if key in _SHARED else value for key, value in data.items()}
+
+
+def _make_gym_env(tasks: Sequence[GymTask], seed: int = 0, **settings: Any) -> EnvBase:
+    from ctgraph_rl.batch.gym_env import GymEnv  # importing Gymnasium takes a tenth of a second
+
+    return GymEnv(tasks, seed, **settings)
+
+
+ENVIRONMENTS[Task] = CTGraphEnv
+ENVIRONMENTS[GymTask] = _make_gym_env

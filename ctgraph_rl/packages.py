@@ -1,4 +1,4 @@
-"""The packages that this one finds by name: `curricula`, `baselines`, and the yaml files in ``conf``."""
+"""Where `curricula`, `baselines` and the yaml files in ``conf`` are, and how modules are imported by name."""
 
 from __future__ import annotations
 
@@ -6,20 +6,13 @@ import gc
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-from ctgraph_rl.checks import ReadOnlyValues, require
-
-if TYPE_CHECKING:
-    import torch
-
-    from ctgraph_rl.tasks.curriculum import Curriculum
-    from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.checks import require
 
 HERE = Path(__file__).resolve().parent
 
@@ -106,18 +99,6 @@ def import_agents(config_dir: Path) -> list[str]:
     return problems
 
 
-def command(module: str) -> Callable[[], None]:
-    """Return the ``main`` of a module of this package, of `curricula` or of `baselines`.
-
-    Raises:
-        ValueError: see `check_packages`.
-    """
-    if not module.startswith("ctgraph_rl."):
-        check_packages()
-    with first_imports():
-        return import_module(module).main
-
-
 @contextmanager
 def importing_from_here() -> Iterator[None]:
     """Find modules in the working directory, too, where a user's own function may be, as a run does."""
@@ -127,53 +108,6 @@ def importing_from_here() -> Iterator[None]:
         yield
     finally:
         sys.path[:] = before
-
-
-def curriculum_named(name: str) -> Curriculum:
-    """Return a published curriculum.
-
-    Raises:
-        ValueError: for an unknown name, with the choices; and see `check_packages`.
-    """
-    check_packages()
-    return import_module("curricula").load(name)
-
-
-def is_published(curriculum: Curriculum) -> bool | None:
-    """Return whether a curriculum is the published one of its name; None if no published one has this name.
-
-    Raises:
-        ValueError: see `check_packages`.
-    """
-    check_packages()
-    published = import_module("curricula")
-    if curriculum.name not in published.names():
-        return None
-    return published.load(curriculum.name).fingerprint == curriculum.fingerprint
-
-
-def why_agents_learn_alone(agent: object, device: torch.device) -> str | None:
-    """Return why agents like this one cannot learn as one batch of seeds on a device; None if they can.
-
-    Raises:
-        ValueError: see `check_packages`.
-    """
-    check_packages()
-    if device.type == "cpu":
-        return import_module("baselines.update.seeds").why_not_together(agent)
-    return import_module("baselines.update.captured").why_not_captured(agent)
-
-
-def agents_together(agents: Sequence[object], generators: Sequence[object], device: torch.device) -> Any:
-    """Return the `ctgraph_rl.learn.loop.Group` of agents on a device, each with what it draws from.
-
-    Raises:
-        ValueError: see `check_packages`.
-    """
-    check_packages()
-    if device.type == "cpu":
-        return import_module("baselines.update.seeds").SeedGroup(agents, generators)
-    return import_module("baselines.update.captured").CapturedGroup(agents, generators)
 
 
 def class_named(module: str, name: str) -> type | None:
@@ -187,23 +121,3 @@ def class_named(module: str, name: str) -> type | None:
         return None
     kind = getattr(import_module(module), name, None)
     return kind if isinstance(kind, type) and kind.__module__ == module else None
-
-
-def profile_properties() -> ReadOnlyValues:
-    """Return the properties of a profile by their curricula; see `curricula.profile`.
-
-    Raises:
-        ValueError: see `check_packages`.
-    """
-    check_packages()
-    return import_module("curricula.profile").PROPERTIES
-
-
-def taught_share(policy: Any, task: Task, initial_state: Any = None) -> float:
-    """Return how much of a model a table learns from a policy's data; see `baselines.models.table_model.taught_share`.
-
-    Raises:
-        ValueError: see `check_packages`.
-    """
-    check_packages()
-    return import_module("baselines.models.table_model").taught_share(policy, task, initial_state)

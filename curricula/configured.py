@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 from ctgraph_rl.checks import are_ints, as_tuple, at_least_one, is_int, one_of, require, takes_its_kinds
-from ctgraph_rl.core.rewards import Gradient, Needle, RewardFn
+from ctgraph_rl.core.rewards import REWARD_FNS
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import OneHot
 from ctgraph_rl.tasks.paper_json import shown_ids
@@ -25,7 +25,6 @@ SWITCHES: dict[str, Callable[[int], Any]] = {
     "at_random": lambda episodes: AtRandom(1 / episodes),
     "drift": Drift,
 }
-REWARD_FNS: dict[str, RewardFn] = {"needle": Needle(), "gradient": Gradient()}
 IMAGE_SIZE = 12
 
 
@@ -100,7 +99,8 @@ def from_axes(
         fail_reward: reward at the fail state [fail_r].
         step_reward: reward of every step, in addition [section 2.5].
         reward_std: standard deviation of the noise on the reward of end states [std_r].
-        reward_fn: what end states pay: ``needle``, only the goal; ``gradient``, the nearer the goal the more [g].
+        reward_fn: what end states pay: ``needle``, only the goal; ``gradient``, the nearer the goal the
+            more; ``reference_linear``, as the authors' implementation [g].
 
     Raises:
         ValueError: for values out of range; lists the choices.
@@ -131,7 +131,7 @@ def from_axes(
         fail_reward=fail_reward,
         step_reward=step_reward,
         reward_std=reward_std,
-        reward_fn=REWARD_FNS[reward_fn],
+        reward_fn=REWARD_FNS[reward_fn](),
     )
     seeds = _several(image_seeds)
     if random_graphs is None:

@@ -67,14 +67,18 @@ KNOW_HYDRA = (
 
 DOORS = {
     "ctgraph_rl": "its names are imported when they are first used",
-    "ctgraph_rl.packages": "the only door to curricula and baselines",
+    "ctgraph_rl.cli": "the module of a command",
+    "ctgraph_rl.log.named_curricula": "the curricula that are published",
+    "ctgraph_rl.packages": "classes of agents and methods by the names that runs stored",
+    "ctgraph_rl.profile.properties": "a table that learns a model of an agent's data",
+    "ctgraph_rl.profile.scoring": "the properties of the profile's curricula",
+    "ctgraph_rl.runs.seeds": "the batches of seeds, which know the agents",
     "ctgraph_rl.board.relearn": "learners of others, in a process of their own",
     "ctgraph_rl.log.sources": "looks for modules of the user, and imports none",
     "ctgraph_rl.metrics": "all of its own modules, so that no metric is left out",
     "ctgraph_rl.report.style": "packages of an extra",
     "ctgraph_rl.runs.trackers": "packages of an extra",
-    "ctgraph_rl.tasks.kinds.gym_task": "the environment of its tasks, which stands above them, and wrappers of others",
-    "ctgraph_rl.tasks.task": "the environment of its tasks, which stands above them",
+    "ctgraph_rl.tasks.kinds.gym_task": "wrappers of others",
     "curricula": "its names are imported when they are first used",
 }
 """Modules that import by name, and why."""

@@ -101,6 +101,13 @@ def test_a_circle_is_found_also_through_functions_and_names_all_of_it():
     assert architecture.circles_at_run_time(found) == ["ctgraph_rl.core.a <-> ctgraph_rl.core.b <-> ctgraph_rl.core.c"]
 
 
+@pytest.mark.parametrize("name", ['"ctgraph_rl.core.a"', 'f"ctgraph_rl.core.{name}"'])
+def test_a_circle_through_an_import_by_name_is_found(name):
+    found = modules(core__a="from ctgraph_rl.log import b", log__b=f"def f():\n    import_module({name})")
+
+    assert architecture.circles_at_run_time(found) == ["ctgraph_rl.core.a <-> ctgraph_rl.log.b"]
+
+
 def test_a_circle_of_annotations_counts_only_between_wings():
     typing = "if TYPE_CHECKING:\n    from ctgraph_rl"
     within = modules(core__a=f"{typing}.core import b", core__b="from ctgraph_rl.core import a")

@@ -171,7 +171,7 @@ def methods() -> Iterator[tuple[str, Any]]:
 
 def constructors() -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
     images = [kind(5) for kind in IMAGE_SETS if kind.__name__ in ("PaperImages", "OneHot")]
-    parts = [BASE, BASE.graph, BASE.observations, ct_fo_b1((1, 2)), *(kind() for kind in REWARD_FNS), *images]
+    parts = [BASE, BASE.graph, BASE.observations, ct_fo_b1((1, 2)), *(kind() for kind in REWARD_FNS.values()), *images]
     parts += [ByEpisode(2), AtRandom(0.5), Drift(3), SMALL_CURRICULUM, SMALL_CURRICULUM.blocks[0], Evaluation(4)]
     parts += [Protocol("one_hot", task_ids=(0, 1)), Block((BASE, ct_su_b1((1, 1))), 32, Drift(3))]
     env = {"tasks": [BASE] * 2, "seed": 0, "first_row": 0, "task_pool": None, "device": "cpu", "check_actions": True}

@@ -69,7 +69,7 @@ class Method(TakesNumbers, Hooks):
                 f"set protocol.task_id=one_hot or at_boundaries{self.hidden_ids_hint}{or_detector}",
             ),
             (
-                not self.needs_boundaries or protocol.boundaries == "announced",
+                not self.needs_boundaries or protocol.announces,
                 f"{name} needs announced task changes: set protocol.boundaries=announced{or_detector}",
             ),
             (

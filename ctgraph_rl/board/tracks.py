@@ -197,7 +197,7 @@ def given(protocol: Protocol, blocks: int) -> str:
         blocks: how many the curriculum has; between several there are boundaries.
     """
     parts = {"one_hot": ["task ids"], "at_boundaries": ["task ids at boundaries"], "hidden": []}[protocol.task_id]
-    if blocks > 1 and protocol.boundaries == "announced" and protocol.task_id != "at_boundaries":
+    if blocks > 1 and protocol.announces and protocol.task_id != "at_boundaries":
         parts.append("boundaries")
     if protocol.guide_frames:
         parts.append("first rewards")

@@ -101,5 +101,5 @@ class ReferenceLinear:
 KERNEL_REWARDS = (Needle, Gradient, ReferenceLinear)
 """The rewards that ``kernel.c`` computes, in its order; any other one, a user's own too, needs the tensor engine."""
 
-REWARD_FNS = (*KERNEL_REWARDS,)
-"""Every reward of this package; JSON names them by their classes."""
+REWARD_FNS = {"needle": Needle, "gradient": Gradient, "reference_linear": ReferenceLinear}
+"""Every reward of this package by the name that settings have; JSON names them by their classes."""

@@ -109,7 +109,7 @@ def _set_tasks(env: EnvBase, block: Block, num_seeds: int, at_episode_end: bool 
 def announced_id(curriculum: Curriculum, block: Block) -> int | None:
     """Return the task id that the agent gets at the announced start of a block of one task, unless ids are hidden."""
     how = curriculum.protocol
-    known = how.task_id != "hidden" and how.boundaries == "announced" and len(set(block.tasks)) == 1
+    known = how.task_id != "hidden" and how.announces and len(set(block.tasks)) == 1
     return curriculum.task_ids[block.tasks[0]] if known else None
 
 

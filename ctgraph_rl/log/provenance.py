@@ -14,9 +14,9 @@ import torchrl
 
 from ctgraph_rl import __version__
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues
+from ctgraph_rl.log.named_curricula import is_published
 from ctgraph_rl.log.run_log import SCHEMA
 from ctgraph_rl.log.sources import find_sources, full_name, is_ours, targets
-from ctgraph_rl.packages import is_published
 from ctgraph_rl.portable import cpu_model, is_portable
 from ctgraph_rl.tasks.curriculum import Curriculum
 

@@ -346,7 +346,7 @@ def _labelling(log: RunLog, curriculum: Curriculum) -> Labelling | Undefined:
         learned=log.training("learned") > 0,
         alarm=log.training("alarm") > 0,
         rolled_back=log.training("rolled_back").nan_to_num().long(),
-        announced=curriculum.protocol.boundaries == "announced",
+        announced=curriculum.protocol.announces,
         oracle=bool((log.training("oracle") > 0).any()),
     )
 
@@ -362,7 +362,7 @@ def _first_blocks(log: RunLog, curriculum: Curriculum) -> NamedValues:
     reason = None
     if any(len(blocks[number]) > 1 for number in first):
         reason = "needs first blocks that train one task each"
-    elif curriculum.protocol.boundaries == "hidden":
+    elif not curriculum.protocol.announces:
         reason = "needs announced boundaries: an episode of one task may end in the block of the next"
     if reason is not None:
         return dict.fromkeys(("first_frames", "first_episodes", "first_success_rates"), Undefined(reason))

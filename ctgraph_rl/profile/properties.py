@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
@@ -16,7 +17,7 @@ from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.scores import mastery_thresholds, optimal_values
 from ctgraph_rl.metrics import Undefined
 from ctgraph_rl.metrics.transfer import stage_areas
-from ctgraph_rl.packages import taught_share
+from ctgraph_rl.packages import check_packages
 from ctgraph_rl.runs.load import load
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import Task, ct_graphs
@@ -132,6 +133,8 @@ def teaches(run: Evidence) -> Measured:
     """
     trained = load(run.folder, _imported_class(run))
     [task] = run.tasks
+    check_packages()
+    taught_share = import_module("baselines.models.table_model").taught_share
     share = taught_share(trained.policy_for(task), task, trained.agent.initial_state)
     return Measured(max(0.0, share), 0.0, 1.0)
 

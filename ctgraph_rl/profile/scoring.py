@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import ReadOnlyValues, require
 from ctgraph_rl.log.files import CURRICULUM, LOG
+from ctgraph_rl.log.named_curricula import curriculum_named
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.metrics import Undefined
-from ctgraph_rl.packages import curriculum_named, profile_properties
+from ctgraph_rl.packages import check_packages
 from ctgraph_rl.profile.properties import Evidence, Measured, measure
 from ctgraph_rl.report.intervals import UNBOUNDED, Bounds
 from ctgraph_rl.report.names import displayed
@@ -119,3 +121,13 @@ def _evidence(run: Run | None) -> Evidence:
     if learned.fingerprint != run.curriculum[1]:
         raise Undefined(f"{run.path} learned another curriculum than the published {run.group[0]}")
     return Evidence(RunLog.read(run.path / LOG), learned, run.path)
+
+
+def profile_properties() -> ReadOnlyValues:
+    """Return the properties of a profile by their curricula; see `curricula.profile`.
+
+    Raises:
+        ValueError: see `check_packages`.
+    """
+    check_packages()
+    return import_module("curricula.profile").PROPERTIES

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from functools import cache
 
 from ctgraph_rl.log.files import CURRICULUM
+from ctgraph_rl.log.named_curricula import curriculum_named
 from ctgraph_rl.log.scores import evaluation_noise, lowest_returns, optimal_values
 from ctgraph_rl.metrics import Undefined
 from ctgraph_rl.metrics.bounds import Known, of_performance
 from ctgraph_rl.metrics.record import METRICS
-from ctgraph_rl.packages import curriculum_named
 from ctgraph_rl.report.intervals import SCALED_DIGITS, UNBOUNDED, Bounds
 from ctgraph_rl.report.statistics import Estimate, constant, mean
 from ctgraph_rl.runs.read import Run, grouped, present

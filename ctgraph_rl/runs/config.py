@@ -40,7 +40,8 @@ from ctgraph_rl.checks import (
     require,
 )
 from ctgraph_rl.disk import made_folder, write_whole
-from ctgraph_rl.packages import check_packages, conf_dir, curriculum_named, importing_from_here
+from ctgraph_rl.log.named_curricula import curriculum_named
+from ctgraph_rl.packages import check_packages, conf_dir, importing_from_here
 from ctgraph_rl.portable import check_portable
 from ctgraph_rl.runs.settings import as_typed, check_arguments, curriculum_names, digest, flat, names_in
 

@@ -7,6 +7,7 @@ import shutil
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.learn.stacked import why_not_together
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CHECKPOINTS, locked
-from ctgraph_rl.packages import agents_together, why_agents_learn_alone
+from ctgraph_rl.packages import check_packages
 from ctgraph_rl.runs import config
 from ctgraph_rl.runs.experts import Expert, Failures, RunDirs, find_or_train, is_of_group
 from ctgraph_rl.runs.interrupt import Interrupt
@@ -205,3 +206,27 @@ def learn_experts(configs: Sequence[Any], task: int) -> None:
     """
     with Interrupt() as interrupt:
         train_experts([Job.of(cfg, interrupt) for cfg in configs], only=task)
+
+
+def why_agents_learn_alone(agent: object, device: torch.device) -> str | None:
+    """Return why agents like this one cannot learn as one batch of seeds on a device; None if they can.
+
+    Raises:
+        ValueError: see `check_packages`.
+    """
+    check_packages()
+    if device.type == "cpu":
+        return import_module("baselines.update.seeds").why_not_together(agent)
+    return import_module("baselines.update.captured").why_not_captured(agent)
+
+
+def agents_together(agents: Sequence[object], generators: Sequence[object], device: torch.device) -> Any:
+    """Return the `ctgraph_rl.learn.loop.Group` of agents on a device, each with what it draws from.
+
+    Raises:
+        ValueError: see `check_packages`.
+    """
+    check_packages()
+    if device.type == "cpu":
+        return import_module("baselines.update.seeds").SeedGroup(agents, generators)
+    return import_module("baselines.update.captured").CapturedGroup(agents, generators)

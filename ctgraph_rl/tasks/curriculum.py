@@ -166,8 +166,7 @@ class Curriculum:
     @property
     def segments(self) -> tuple[tuple[Block, ...], ...]:
         """The blocks between two announced boundaries: each separately, or all of them where boundaries are hidden."""
-        announced = self.protocol.boundaries == "announced"
-        return tuple((block,) for block in self.blocks) if announced else (self.blocks,)
+        return tuple((block,) for block in self.blocks) if self.protocol.announces else (self.blocks,)
 
     @property
     def task_ids(self) -> dict[TaskLike, int]:

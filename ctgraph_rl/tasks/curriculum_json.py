@@ -54,7 +54,7 @@ MAX_BANK_BYTES = 2**36
 _KEYS = ("schema", "fingerprint", "name", "version", "source", "tasks", "blocks", "evaluation", "protocol")
 _DERIVED = "about"
 
-_CHOSEN = (*IMAGE_SETS, *REWARD_FNS, *SWITCHES)
+_CHOSEN = (*IMAGE_SETS, *REWARD_FNS.values(), *SWITCHES)
 """Types of which a curriculum has one of several, so that JSON names it."""
 
 _OURS = (*_CHOSEN, Task, CTGraph, Observations, Block, Evaluation, Protocol)
@@ -265,7 +265,7 @@ def _graph(content: Any) -> Task:
         "graph": partial(_built, CTGraph, readers={}),
         "observations": partial(_built, Observations, readers={}),
         "images": partial(_chosen, IMAGE_SETS),
-        "reward_fn": partial(_chosen, REWARD_FNS),
+        "reward_fn": partial(_chosen, [*REWARD_FNS.values()]),
     }
     task = _built(Task, content, parts)
     needed = bank_bytes([task])

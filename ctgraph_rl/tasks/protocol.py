@@ -219,7 +219,7 @@ class Protocol:
         is_ids = ids is None or (are_ints(ids, 0, MOST_IDS) and bool(ids))
         names_ids = self.task_id != "hidden" or (ids is None and self.num_task_ids is None)
         differ = not isinstance(ids, tuple) or not is_ids or len(set(ids)) == len(ids)
-        hidden_gift = self.task_id == "at_boundaries" and self.boundaries == "hidden"
+        hidden_gift = self.task_id == "at_boundaries" and not self.announces
         is_length = self.num_task_ids is None or is_int(self.num_task_ids, 1, MOST_IDS)
         require(
             (is_int(self.guide_frames, 0), f"guide_frames must be an integer >= 0, got {self.guide_frames!r}"),
@@ -229,6 +229,11 @@ class Protocol:
             (names_ids, "num_task_ids and task_ids say nothing where task_id is hidden: leave them out"),
             (not hidden_gift, "task_id cannot be given at_boundaries that are hidden; use one_hot, or announced ones"),
         )
+
+    @property
+    def announces(self) -> bool:
+        """Whether boundaries between blocks are announced to the agent."""
+        return self.boundaries == "announced"
 
     def ids(self, num_tasks: int) -> tuple[int, ...]:
         """The id of each of ``num_tasks`` tasks.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import import_module
 from os import PathLike
 from typing import Any, ClassVar, Self, TypeGuard
 
@@ -28,6 +27,7 @@ from ctgraph_rl.core.rewards import Needle, RewardFn
 from ctgraph_rl.parsers import Decisions
 from ctgraph_rl.tasks import reference, values
 from ctgraph_rl.tasks.images import ImageSet, has_cue_element
+from ctgraph_rl.tasks.kinds.registry import environment
 from ctgraph_rl.tasks.kinds.task_like import TaskLike
 from ctgraph_rl.tasks.observations import Observations
 
@@ -177,7 +177,7 @@ class Task:
     @classmethod
     def make_env(cls, tasks: Sequence[Task], seed: int = 0, **settings: Any) -> Any:
         """Return a `ctgraph_rl.CTGraphEnv` with one row for each of ``tasks``; see `TaskLike`."""
-        return import_module("ctgraph_rl.env").CTGraphEnv(tasks, seed, **settings)
+        return environment(Task)(tasks, seed, **settings)
 
     def _check_parts(self) -> None:
         images = self.images

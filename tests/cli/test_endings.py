@@ -10,7 +10,7 @@ from helpers.made_runs import write_run
 from helpers.sweeping import command_line
 
 from ctgraph_rl import cli, run
-from ctgraph_rl.packages import command
+from ctgraph_rl.cli import command
 
 
 def test_a_pipe_that_breaks_elsewhere_is_an_error(monkeypatch):

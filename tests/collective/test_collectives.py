@@ -11,7 +11,8 @@ import torch
 from helpers.kill_runs import equal
 from helpers.sweeping import command_line, sweep
 
-from ctgraph_rl import RunLog, packages
+import curricula
+from ctgraph_rl import RunLog
 from ctgraph_rl.collective import __main__ as collectives
 from ctgraph_rl.collective import job
 from ctgraph_rl.collective.report import find_collectives
@@ -320,11 +321,11 @@ def test_a_folder_without_collectives_is_refused(monkeypatch, capsys):
 
 
 def test_long_task_ids_are_warned_of_before_members_learn(capsys):
-    curricula = [packages.curriculum_named(name) for name in ("ct2_interfering", "ct28")]
+    learned = [curricula.load(name) for name in ("ct2_interfering", "ct28")]
 
-    job._warn_of_long_ids(curricula[:1])
+    job._warn_of_long_ids(learned[:1])
     first = capsys.readouterr().err
-    job._warn_of_long_ids(curricula)
+    job._warn_of_long_ids(learned)
 
     assert first == ""
     assert "each observation of ct28 has a task id of 16,368 numbers" in capsys.readouterr().err

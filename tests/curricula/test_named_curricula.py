@@ -12,6 +12,7 @@ from pathlib import Path
 
 import hydra
 import pytest
+from helpers.conf_files import conf_file
 from omegaconf import OmegaConf
 
 import curricula
@@ -21,7 +22,6 @@ from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_fo_b2, ct_pos
 from ctgraph_rl.tasks.images import PaperImages
 from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from curricula import axes
-from curricula.conf_files import conf_file
 from curricula.gym import NEEDS
 from curricula.paper import KINDS, configured
 
@@ -101,7 +101,7 @@ def test_every_yaml_is_a_named_curriculum_or_the_one_of_free_axes():
 def test_a_yaml_is_written_from_the_signature_and_the_docstring_of_its_function(name):
     written = (FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
 
-    assert written == conf_file(name), "run python -m curricula.conf_files"
+    assert written == conf_file(name), "run python -m tests.helpers.conf_files"
 
 
 def test_every_name_has_a_sentence_about_it():

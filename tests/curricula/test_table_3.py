@@ -116,7 +116,7 @@ def test_vectors_of_several_depths_have_one_length():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"reward_fn": "linear"}, "reward_fn must be one of needle, gradient, got 'linear'"),
+        ({"reward_fn": "linear"}, "reward_fn must be one of needle, gradient, reference_linear, got 'linear'"),
         ({"one_hot": True, "image_seeds": [1, 2]}, "one_hot has no image_seeds and no image_size: leave them out"),
         ({"one_hot": True, "read_noise": 1}, "read_noise, read_rotation and reward_cue need images, not one-hot"),
         ({"image_size": 10}, "image_size must be a multiple of 4, got 10"),

@@ -15,11 +15,12 @@ import pytest
 import torch
 
 import curricula
+from baselines.models.table_model import taught_share
 from ctgraph_rl import Recorder, RunLog
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.evaluate import Evaluator
 from ctgraph_rl.metrics import Undefined
-from ctgraph_rl.packages import conf_dir, taught_share
+from ctgraph_rl.packages import conf_dir
 from ctgraph_rl.policies import NavigationPolicy, OptimalPolicy, RandomPolicy, SearchPolicy
 from ctgraph_rl.profile.properties import Evidence, Measured, measure
 from ctgraph_rl.profile.scoring import profile_scores, score_of

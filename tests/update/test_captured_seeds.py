@@ -19,10 +19,10 @@ from ctgraph_rl import Block, RunLog
 from ctgraph_rl.core import philox
 from ctgraph_rl.learn import collect
 from ctgraph_rl.learn.stacked import learn_together
-from ctgraph_rl.packages import agents_together, why_agents_learn_alone
 from ctgraph_rl.runs import checkpoints, train
 from ctgraph_rl.runs import seeds as runs_seeds
 from ctgraph_rl.runs.config import target
+from ctgraph_rl.runs.seeds import agents_together, why_agents_learn_alone
 from ctgraph_rl.runs.train import new_agent, with_method
 
 EIGHT = tuple(range(8))

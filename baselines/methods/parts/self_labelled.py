@@ -52,7 +52,7 @@ class SelfLabelled:
         how = curriculum.protocol
         detector = type(self.detector).__name__
         method = type(self.method).__name__
-        hidden = how.boundaries == "hidden" or self.detector.is_oracle
+        hidden = not how.announces or self.detector.is_oracle
         several = multi_task_blocks(curriculum)
         reads = getattr(self.method, "reads_tasks", "")
         room = self.num_labels(curriculum)

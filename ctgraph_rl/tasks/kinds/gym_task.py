@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ctgraph_rl.checks import as_tuple, is_int, is_real, make_fields_plain, require, true_or_false
+from ctgraph_rl.tasks.kinds.registry import environment
 
 if TYPE_CHECKING:
     import gymnasium
@@ -117,7 +118,7 @@ class GymTask:
     @classmethod
     def make_env(cls, tasks: Sequence[GymTask], seed: int = 0, **settings: Any) -> Any:
         """Return a `ctgraph_rl.batch.gym_env.GymEnv` with one row for each of ``tasks``; see `TaskLike`."""
-        return import_module("ctgraph_rl.batch.gym_env").GymEnv(tasks, seed, **settings)
+        return environment(GymTask)(tasks, seed, **settings)
 
     def make(self) -> gymnasium.Env[Any, Any]:
         """Return the environment, wrapped.

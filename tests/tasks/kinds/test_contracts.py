@@ -16,9 +16,10 @@ from tensordict.nn import TensorDictModule
 import curricula
 from baselines.a2c import A2C
 from baselines.methods.si import SI
-from ctgraph_rl import CTGraphEnv, Protocol
+from ctgraph_rl import CTGraphEnv, Protocol, Task
 from ctgraph_rl.runs.config import target
 from ctgraph_rl.tasks.kinds.gym_task import GymTask
+from ctgraph_rl.tasks.kinds.registry import ENVIRONMENTS
 from ctgraph_rl.testing import AgentContract, EnvironmentContract, MethodContract, TaskContract
 from curricula.paper import ct_su_b1
 
@@ -170,7 +171,7 @@ class Unsaved(CTGraphEnv):
     ],
 )
 def test_a_contract_fails_for_an_environment_that_breaks_it(kind, name, monkeypatch):
-    monkeypatch.setattr("ctgraph_rl.env.CTGraphEnv", kind)
+    monkeypatch.setitem(ENVIRONMENTS, Task, kind)
 
     with pytest.raises(AssertionError):
         getattr(TestGraphsOfManyOptions(), name)()

@@ -1,4 +1,4 @@
-"""The yaml files in ``conf/curriculum``, which ``python -m curricula.conf_files`` writes.
+"""The yaml files in ``conf/curriculum``, which ``python -m tests.helpers.conf_files`` writes.
 
 Names, defaults and comments are those of the functions' signatures and docstrings, where alone they are changed.
 """
