@@ -126,10 +126,10 @@ def test_the_page_plays_200_settings_with_the_bits_of_python():
 
 def test_presets_are_the_configurations_of_the_paper():
     text = (PLAY / "graph.js").read_text()
-    pattern = r'"(CT-[\w-]+)": \{ b: (\d), d: (\d), p: ([\d.]+), shown: "(\w+)", goal: "(\d+)" \}'
+    pattern = r'"(CT-[\w-]+)": \{ b: (\d), d: (\d), p: ([\d.]+), shown: "(\w+)" \}'
     found = {
-        name: task_of({"b": int(b), "d": int(d), "p": float(p), "shown": shown, "goal": goal})
-        for name, b, d, p, shown, goal in re.findall(pattern, text)
+        name: task_of({"b": int(b), "d": int(d), "p": float(p), "shown": shown, "goal": "1" * int(d)})
+        for name, b, d, p, shown in re.findall(pattern, text)
     }
 
     assert found == {name: configuration() for name, configuration in PRESETS.items()}
@@ -180,7 +180,7 @@ def test_the_kernel_built_here_is_the_same_file_or_by_another_compiler_has_the_b
     check_trajectories(range(12), tmp_path)
 
 
-GIVEN = {"b": 2, "d": 2, "p": 0.5, "shown": "full", "goal": "12"}
+GIVEN = {"b": 2, "d": 2, "p": 0.5, "shown": "full"}
 
 
 REFUSED = (
@@ -188,9 +188,8 @@ REFUSED = (
     ({"d": 1.5}, "d must be an integer in 1..8 on this page, got 1.5."),
     ({"p": 1}, "p must be in [0, 1), got 1."),
     ({"p": None}, "p must be in [0, 1), got null."),
-    ({"goal": "13"}, "The goal must be 2 digits in 1..2, such as 11, got 13."),
     ({"shown": "x"}, "The observations must be full, surjective, confounding, got x."),
-    ({"d": 7, "goal": "1111111"}, "A fully observable graph needs an image for each of its 512 states"),
+    ({"d": 7}, "A fully observable graph needs an image for each of its 512 states"),
 )
 
 
@@ -200,6 +199,13 @@ def test_a_value_out_of_range_is_refused_with_the_rule():
     assert taken is None
     for answer, (_, message) in zip(answers, REFUSED, strict=True):
         assert answer.startswith(message)
+
+
+def test_a_drawn_goal_takes_two_branches_and_can_be_each_of_those():
+    (goals,) = in_node([("drawnGoals", [{"b": 3, "d": 2}, 300])])
+
+    assert set(goals) == {"12", "13", "21", "23", "31", "32"}
+    assert in_node([("drawnGoals", [{"b": 2, "d": 1}, 50])])[0].count("2") in range(10, 40)
 
 
 NO_LOGS = (
@@ -239,25 +245,57 @@ def test_a_log_gives_the_performance_matrix_and_the_ends_of_episodes():
     ]
 
 
+ERRORS = """<script>
+const errors = [];
+addEventListener("error", (event) => errors.push(event.message));
+console.error = (...words) => errors.push(words.join(" "));
+</script>"""
+
 PLAYED = """<script>
-const press = (key) => document.body.dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true }));
 const text = (id) => document.getElementById("ct-" + id).textContent;
+const goal = [...task.goal];
+const leaks = [];
+const look = () => {
+  const marks = document.querySelectorAll("#ct-play .here, #ct-play .goal").length;
+  const seen = document.getElementById("ct-play").outerHTML + location.href + document.title;
+  if (marks || seen.includes(goal.join("")) || seen.includes(goal.join("."))) leaks.push(text("outcome"));
+};
+const press = (key) => {
+  document.body.dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true }));
+  if (!document.getElementById("ct-reveal").checked) look();
+};
+const toTheGoal = () => { press("0"); for (const branch of goal) { press("0"); press(branch); } };
 const found = { refused: text("refusal"), link: location.hash, preset: document.getElementById("ct-preset").value };
-for (const key of "001020") press(key);
+look();
+found.before = [text("own"), text("random"), text("drawn")];
+toTheGoal();
 const last = document.getElementById("ct-actions").children[0];
 last.focus();
 last.click();
 found.focus = document.activeElement === last && last.ariaDisabled;
-found.image = document.getElementById("ct-image").getAttribute("aria-label");
-document.getElementById("ct-reveal").click();
-const tree = document.getElementById("ct-tree").getAttribute("aria-label");
-const played = { outcome: text("outcome"), hidden: text("hidden"), tree };
+found.outcome = text("outcome");
+found.after = [text("own"), text("drawn"), text("fixed")];
+found.tree = document.getElementById("ct-tree").getAttribute("aria-label");
 press("n");
-const again = text("outcome");
+found.again = text("outcome");
+for (const key of "01") press(key);
+found.failed = text("own");
+found.leaks = leaks;
+press("n");
+document.getElementById("ct-reveal").click();
+toTheGoal();
+press("0");
+found.shown = text("hidden") === `You are at the end state of node ${rows.node[0]}. The goal is ${goal.join(".")}. `
+  + "This episode does not count.";
+found.marks = [document.querySelectorAll("circle.here").length, document.querySelectorAll("circle.goal").length];
+found.uncounted = [text("outcome"), text("own")];
+document.getElementById("ct-another").click();
+found.new = [text("own"), text("drawn")];
 const b = document.getElementById("ct-b");
 b.value = "9";
 b.dispatchEvent(new Event("change"));
-const wide = document.documentElement.scrollWidth <= window.innerWidth;
+found.wrong = text("refusal");
+found.wide = document.documentElement.scrollWidth <= window.innerWidth;
 document.getElementById("ct-simulate").click();
 const lines = [
   { kind: "run", curriculum: "mine" },
@@ -266,11 +304,9 @@ const lines = [
 ];
 const file = new File(lines.map((line) => JSON.stringify(line) + "\\n"), "run.jsonl");
 showLog(file).then(() => setTimeout(() => {
-  const answer = { ...found, ...played, again, wide, wrong: text("refusal"), log: text("log") };
-  answer.reward = text("rewardProb");
+  const answer = { ...found, log: text("log"), measured: text("measured"), errors };
   const cells = document.querySelectorAll("#ct-matrix td, #ct-matrix [scope=row]");
   answer.cells = [...cells].map((cell) => cell.textContent);
-  answer.measured = text("measured");
   document.querySelector("#ct-matrix button").click();
   const fills = [...document.querySelectorAll("#ct-visits circle")].slice(-4);
   answer.visits = fills.map((mark) => [mark.style.fillOpacity, mark.classList.contains("goal")]);
@@ -283,13 +319,13 @@ showLog(file).then(() => setTimeout(() => {
 @pytest.mark.slow
 @pytest.mark.skipif(BROWSER is None, reason="needs a browser: apt-get install chromium")
 @pytest.mark.parametrize("width", [360, 1600])
-def test_a_browser_plays_to_the_goal_by_keys_from_a_file_opened_by_hand(tmp_path, width):
+def test_a_browser_plays_a_game_to_its_goal_which_nothing_on_the_page_tells(tmp_path, width):
     page = (CHECKOUT / "docs" / "tutorials" / "play_and_explore.md").read_text()
     form = page[page.index("<div id=") : page.rindex("</script>") + len("</script>")]
     shutil.copytree(PLAY, tmp_path / "_static" / "play")
     (tmp_path / "tutorials").mkdir()
-    (tmp_path / "tutorials" / "page.html").write_text(f"<!doctype html><meta charset=utf-8>{form}{PLAYED}")
-    link = "b=2&d=2&p=0&shown=full&goal=12"
+    (tmp_path / "tutorials" / "page.html").write_text(f"<!doctype html><meta charset=utf-8>{ERRORS}{form}{PLAYED}")
+    link = "b=2&d=6&p=0&shown=surjective"
     words = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", f"--window-size={width},900", "--dump-dom"]
     done = subprocess.run(
         [*words, "--virtual-time-budget=20000", f"file://{tmp_path}/tutorials/page.html#{link}"],
@@ -302,14 +338,23 @@ def test_a_browser_plays_to_the_goal_by_keys_from_a_file_opened_by_hand(tmp_path
     assert said, done.stdout[-2000:] + done.stderr
     found = json.loads(unescape(said[1]))
     assert (found["refused"], found["link"], found["preset"]) == ("", f"#{link}", "")
-    assert found["outcome"] == "The episode ends after 6 steps: goal, reward 1. Press n for a new one."
-    assert (found["focus"], found["image"]) == ("true", "The agent sees image 13")
-    assert found["hidden"] == "You are at the end state of node 4. The goal is 12."
-    assert found["tree"] == "The tree of 4 end states. You are at the end state of node 4."
+    assert (found["leaks"], found["errors"]) == ([], [])
+    own, random_share, drawn = found["before"]
+    assert (own, drawn) == ("no episode yet", "after your first success")
+    assert float(random_share) == pytest.approx(CTGraph(2, 6).reward_prob_random, rel=1e-3)
+    assert found["outcome"] == "The episode ends after 14 steps: goal, reward 1. Press n for a new one."
+    assert found["focus"] == "true"
+    own, drawn, fixed = found["after"]
+    assert (own, fixed, 0 < float(drawn) < 1) == ("1 (1 of 1)", "0", True)
+    assert found["tree"] == "The tree of 64 end states."
     assert found["again"].startswith("A new episode begins")
+    assert found["failed"] == "0.5 (1 of 2)"
+    assert (found["shown"], found["marks"]) == (True, [1, 1])
+    assert found["uncounted"] == [found["outcome"], "0.5 (1 of 2)"]
+    assert found["new"] == ["no episode yet", "after your first success"]
     assert found["wrong"] == "b must be an integer in 2..5 on this page, got 9."
-    assert (found["reward"], found["wide"]) == ("0.004115", True)
-    assert re.match(r"[\d,]+ of [\d,]+ random episodes reach the goal, a share of 0\.00[345]", found["measured"])
+    assert found["wide"]
+    assert re.match(r"[\d,]+ of [\d,]+ random episodes reach the goal, a share of ", found["measured"])
     assert found["log"].startswith(
         "run.jsonl: mine. Mean return on each task after each block, and where episodes ended;"
     )

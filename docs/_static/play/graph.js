@@ -3,11 +3,11 @@
 "use strict";
 
 const PRESETS = {
-  "CT-FO-B1": { b: 2, d: 2, p: 0, shown: "full", goal: "11" },
-  "CT-SU-B1": { b: 2, d: 2, p: 0, shown: "surjective", goal: "11" },
-  "CT-CO-B1": { b: 2, d: 2, p: 0, shown: "confounding", goal: "11" },
-  "CT-POSR-B1": { b: 2, d: 2, p: 0.5, shown: "surjective", goal: "11" },
-  "CT-FO-B2": { b: 2, d: 3, p: 0.5, shown: "full", goal: "111" },
+  "CT-FO-B1": { b: 2, d: 2, p: 0, shown: "full" },
+  "CT-SU-B1": { b: 2, d: 2, p: 0, shown: "surjective" },
+  "CT-CO-B1": { b: 2, d: 2, p: 0, shown: "confounding" },
+  "CT-POSR-B1": { b: 2, d: 2, p: 0.5, shown: "surjective" },
+  "CT-FO-B2": { b: 2, d: 3, p: 0.5, shown: "full" },
 };
 
 const KINDS = ["home", "wait", "decision", "end", "fail"];
@@ -37,19 +37,27 @@ function sizes({ b, d }) {
 }
 
 // Why these parameters are refused, in a sentence; null for those that are not.
-function refusal({ b, d, p, shown, goal }) {
+function refusal({ b, d, p, shown }) {
   const whole = (value, low, high) => Number.isInteger(value) && value >= low && value <= high;
   if (!whole(b, 2, MOST.b)) return `b must be an integer in 2..${MOST.b} on this page, got ${b}.`;
   if (!whole(d, 1, MOST.d)) return `d must be an integer in 1..${MOST.d} on this page, got ${d}.`;
   if (!(typeof p === "number" && p >= 0 && p < 1)) return `p must be in [0, 1), got ${p}.`;
   if (!SHOWN.includes(shown)) return `The observations must be ${SHOWN.join(", ")}, got ${shown}.`;
-  const digits = [...goal].map(Number);
-  if (digits.length !== d || !digits.every((digit) => whole(digit, 1, b)))
-    return `The goal must be ${d} digits in 1..${b}, such as ${"1".repeat(d)}, got ${goal}.`;
   const { states } = sizes({ b, d });
   if (shown === "full" && states > NUM_IMAGES)
     return `A fully observable graph needs an image for each of its ${states} states, and this page has ${NUM_IMAGES}: choose a smaller d, or surjective.`;
   return null;
+}
+
+// A goal of d decisions in 1..b, as digits, by random numbers in [0, 1). From d = 2 on two of them differ: a policy
+// without memory that always takes one branch misses it.
+function drawnGoal({ b, d }, random) {
+  const digits = Array.from({ length: d }, () => 1 + Math.floor(random() * b));
+  if (d > 1 && new Set(digits).size === 1) {
+    const place = Math.floor(random() * d);
+    digits[place] = 1 + (digits[place] + Math.floor(random() * (b - 1))) % b;
+  }
+  return digits.join("");
 }
 
 const leafOf = ({ b, goal }) => [...goal].reduce((leaf, digit) => leaf * b + Number(digit) - 1, 0);

@@ -6,7 +6,8 @@ const ROWS = 256, STEPS = 64; // of the simulation, at a time
 const MOST_DRAWN = 64; // nodes side by side in the picture of the tree
 const SVG = "http://www.w3.org/2000/svg";
 
-let task = null; // what is played
+let task = null; // what is played; its goal is drawn and stays hidden
+let score = null; // episodes that count, those at the goal, and whether the present one counts
 let rows = null; // one row of the kernel
 let run = null; // the simulation: rows of the kernel and what was counted
 
@@ -30,7 +31,7 @@ function say(id, text) {
 // The parameters in the form.
 function given() {
   const number = (id) => (at(id).value.trim() === "" ? NaN : Number(at(id).value));
-  return { b: number("b"), d: number("d"), p: number("p"), shown: at("shown").value, goal: at("goal").value.trim() };
+  return { b: number("b"), d: number("d"), p: number("p"), shown: at("shown").value };
 }
 
 function fill(values) {
@@ -42,15 +43,22 @@ function choose() {
   const wanted = given(), why = refusal(wanted);
   say("refusal", why || "");
   if (why) return;
-  task = wanted;
-  const same = Object.entries(PRESETS).find(([, each]) => JSON.stringify(each) === JSON.stringify(task));
+  const same = Object.entries(PRESETS).find(([, each]) => JSON.stringify(each) === JSON.stringify(wanted));
   at("preset").value = same ? same[0] : "";
-  history.replaceState(null, "", `#${new URLSearchParams(task)}`);
+  history.replaceState(null, "", `#${new URLSearchParams(wanted)}`);
+  play(wanted);
+}
+
+// Play a graph with a new goal, from the first episode on.
+function play(graph) {
+  task = { ...graph, goal: drawnGoal(graph, Math.random) };
   rows = new Rows(task, 1, 1, Math.floor(Math.random() * 2 ** 31));
+  score = { episodes: 0, goals: 0, counts: true };
   stop();
   run = null;
   at("actions").replaceChildren(...Array.from({ length: task.b + 1 }, (_, action) => button(action)));
   showNumbers();
+  showScore();
   showRun();
   begin();
 }
@@ -66,6 +74,7 @@ function button(action) {
 function begin() {
   rows.reset();
   rows.outcome[0] = 0;
+  score.counts = !at("reveal").checked;
   say("outcome", "A new episode begins at the home state: any action leaves it.");
   show();
 }
@@ -78,6 +87,11 @@ function act(action) {
   say("outcome", outcome === "running"
     ? `Action ${action}, step ${steps}, reward ${reward}. You see image ${imageNumber(rows.observation)}.`
     : `The episode ends after ${steps} steps: ${outcome}, reward ${reward}. Press n for a new one.`);
+  if (rows.outcome[0] && score.counts) {
+    score.episodes++;
+    if (outcome === "goal") score.goals++;
+    showScore();
+  }
   show();
 }
 
@@ -91,8 +105,21 @@ function show() {
   // `disabled` would take the focus from the button that ended the episode
   for (const each of at("actions").children) each.setAttribute("aria-disabled", String(rows.outcome[0] !== 0));
   const kind = KINDS[rows.kind[0]], node = Number(rows.node[0]);
-  say("hidden", at("reveal").checked ? `You are at ${placed(kind, node)}. The goal is ${task.goal}.` : "");
+  const shows = at("reveal").checked;
+  if (shows) score.counts = false;
+  const goal = [...task.goal].join(".");
+  say("hidden", shows ? `You are at ${placed(kind, node)}. The goal is ${goal}. This episode does not count.` : "");
   drawTree();
+}
+
+// Own successes beside exact success rates; those that depend on the goal appear once it was reached.
+function showScore() {
+  const { episodes, goals } = score;
+  const share = episodes ? `${rounded(goals / episodes)} (${grouped(goals)} of ${grouped(episodes)})` : "no episode yet";
+  say("own", share);
+  const { drawn, fixed } = ceilings(task);
+  say("drawn", goals ? rounded(drawn) : "after your first success");
+  say("fixed", goals ? rounded(fixed) : "after your first success");
 }
 
 function drawTree() {
@@ -102,14 +129,15 @@ function drawTree() {
   const svg = at("tree"), here = Number(rows.node[0]), kind = KINDS[rows.kind[0]];
   const share = (number) => run.visits[number] / run.ends;
   drawNodes(svg, task, levels, reveal, run && run.ends ? share : null, (mark, node) => {
-    if (node === here && kind !== "home" && kind !== "fail") mark.classList.add("here");
+    if (reveal && node === here && kind !== "home" && kind !== "fail") mark.classList.add("here");
   });
   for (const [name, x] of [["home", 150], ["fail", 250]]) {
     const mark = element("text", { x, y: 16, "text-anchor": "middle" }, svg);
     mark.textContent = name;
-    if (kind === name) mark.classList.add("here");
+    if (reveal && kind === name) mark.classList.add("here");
   }
-  svg.setAttribute("aria-label", `The tree of ${grouped(b ** d)} end states. You are at ${placed(kind, here)}.`);
+  const place = reveal ? ` You are at ${placed(kind, here)}.` : "";
+  svg.setAttribute("aria-label", `The tree of ${grouped(b ** d)} end states.${place}`);
   say("depth", levels < d ? `The picture ends at level ${levels} of ${d}.` : "");
 }
 
@@ -147,11 +175,11 @@ function showVisits(measured, tree, words) {
 }
 
 function showNumbers() {
-  const forms = closedForms(task), { drawn, fixed } = ceilings(task);
+  const forms = closedForms(task);
   const values = {
     states: grouped(forms.states), rewardProb: rounded(forms.rewardProb), endProb: rounded(forms.endProb),
     navigationProb: rounded(forms.navigationProb), length: rounded(forms.length),
-    search: grouped(forms.search), drawn: rounded(drawn), fixed: rounded(fixed),
+    search: grouped(forms.search), random: rounded(forms.rewardProb),
   };
   for (const [name, value] of Object.entries(values)) say(name, value);
 }
@@ -247,13 +275,14 @@ async function showLog(file) {
 }
 
 function start() {
-  for (const name of ["b", "d", "p", "shown", "goal"]) at(name).addEventListener("change", choose);
+  for (const name of ["b", "d", "p", "shown"]) at(name).addEventListener("change", choose);
   at("preset").addEventListener("change", () => {
     if (!at("preset").value) return;
     fill(PRESETS[at("preset").value]);
     choose();
   });
   at("new").addEventListener("click", begin);
+  at("another").addEventListener("click", () => play(task));
   at("reveal").addEventListener("change", show);
   at("simulate").addEventListener("click", toggle);
   at("file").addEventListener("change", () => at("file").files.length && showLog(at("file").files[0]));
@@ -268,14 +297,10 @@ function start() {
     if (event.key === "n") begin();
   });
   const linked = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
-  fill(PRESETS["CT-SU-B1"]);
-  for (const name of ["b", "d", "p", "shown", "goal"]) if (name in linked) at(name).value = linked[name];
+  fill(PRESETS["CT-FO-B1"]);
+  for (const name of ["b", "d", "p", "shown"]) if (name in linked) at(name).value = linked[name];
   choose();
-  if (!task) { // the link is refused: its message stays
-    task = PRESETS["CT-SU-B1"];
-    rows = new Rows(task);
-    begin();
-  }
+  if (!task) play(PRESETS["CT-FO-B1"]); // the link is refused: its message stays
 }
 
 start();

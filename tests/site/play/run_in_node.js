@@ -26,7 +26,8 @@ function play({ task, seed, actions, steps, count }) {
 }
 function answer(what, given) {
   if (what === "play") return { packed: [...packed(given.task)].map(String), rows: play(given) };
-  return { refusal, closedForms, ceilings, performanceMatrix, leafOf }[what](...given);
+  const drawnGoals = (graph, count) => Array.from({ length: count }, () => drawnGoal(graph, Math.random));
+  return { drawnGoals, refusal, closedForms, ceilings, performanceMatrix, leafOf }[what](...given);
 }`);
 
 const names = [
