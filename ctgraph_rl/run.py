@@ -28,7 +28,15 @@ from ctgraph_rl.log.files import LOG
 from ctgraph_rl.log.refuse import quiet_where_nobody_reads
 from ctgraph_rl.packages import check_packages, conf_dir, first_imports, makes_page
 from ctgraph_rl.portable import Restart, become_portable, restart
-from ctgraph_rl.runs.config import check_one_cell, composed, explain, in_sweep, of_hydra
+from ctgraph_rl.runs.config import (
+    check_one_cell,
+    check_resolved,
+    composed,
+    explain,
+    in_sweep,
+    of_hydra,
+    register_run_name,
+)
 from ctgraph_rl.runs.settings import in_digits, names_in
 from ctgraph_rl.runs.sweep import Sweeper, sweepable
 
@@ -134,27 +142,41 @@ class Stop(BaseException):
         self.message = message
 
 
-@of_hydra(hydra.main)(config_path=conf_dir(), config_name="config")
-def _job(cfg: DictConfig) -> float | None:
-    run_dir = Path(HydraConfig.get().runtime.output_dir)
-    if HydraConfig.get().job.chdir:
-        os.chdir(HydraConfig.get().runtime.cwd)  # relative paths are of the directory that the command was given in
-    try:
-        check_one_cell()
-        sweeper = _sweeper()
-        name_one = f"hydra/sweeper={sweeper} searches by a metric: name it, such as objective=average_performance"
-        require((cfg.objective is not None or sweeper not in SEARCHERS, name_one))
-        if cfg.portable is True and not in_sweep():
-            become_portable()
-        with redirect_stdout(io.StringIO()) if in_sweep() else quiet_where_nobody_reads():
-            return run(cfg, run_dir)
-    except BaseException as error:
-        remove_empty(run_dir)
-        if in_sweep() and isinstance(error, Exception):
-            raise CellError(f"{type(error).__name__}: {explain(error, cfg)}") from None
-        if isinstance(error, ERRORS):
-            raise Stop(error, explain(error, cfg)) from error
-        raise
+class HydraJob:
+    """What Hydra calls with a configuration.
+
+    The processes of a launcher get it by pickle, and with it the name that a run's directory has: an import registers
+    nothing with Hydra.
+    """
+
+    def __init__(self) -> None:
+        register_run_name()
+
+    def __reduce__(self) -> tuple[type[HydraJob], tuple[()]]:
+        return HydraJob, ()
+
+    def __call__(self, cfg: DictConfig) -> float | None:
+        """Run one cell, and return its value for a sweeper that searches."""
+        run_dir = Path(HydraConfig.get().runtime.output_dir)
+        if HydraConfig.get().job.chdir:
+            os.chdir(HydraConfig.get().runtime.cwd)  # relative paths are of the directory that the command was given in
+        try:
+            check_resolved(cfg)
+            check_one_cell()
+            sweeper = _sweeper()
+            name_one = f"hydra/sweeper={sweeper} searches by a metric: name it, such as objective=average_performance"
+            require((cfg.objective is not None or sweeper not in SEARCHERS, name_one))
+            if cfg.portable is True and not in_sweep():
+                become_portable()
+            with redirect_stdout(io.StringIO()) if in_sweep() else quiet_where_nobody_reads():
+                return run(cfg, run_dir)
+        except BaseException as error:
+            remove_empty(run_dir)
+            if in_sweep() and isinstance(error, Exception):
+                raise CellError(f"{type(error).__name__}: {explain(error, cfg)}") from None
+            if isinstance(error, ERRORS):
+                raise Stop(error, explain(error, cfg)) from error
+            raise
 
 
 def remove_empty(run_dir: Path) -> None:
@@ -183,7 +205,7 @@ def main() -> None:
                     return
                 sys.argv = ["ctgraph-rl", *sweepable(in_digits(words))]
                 Sweeper.done = ()
-                _job()
+                of_hydra(hydra.main)(config_path=conf_dir(), config_name="config")(HydraJob())()
                 if Sweeper.done:
                     show_sweep(Sweeper.done)
         except Restart:

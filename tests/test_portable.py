@@ -148,7 +148,7 @@ def test_a_command_starts_again_as_it_was_given(monkeypatch):
     monkeypatch.setattr(os, "execve", lambda *call: started.append(call))
     monkeypatch.setattr(sys, "argv", ["/bin/ctgraph-rl", "portable=true"])
     monkeypatch.setattr(sys, "orig_argv", ["python", "-X", "dev", *sys.argv])
-    monkeypatch.setattr(run, "_job", become_portable)
+    monkeypatch.setattr(run.hydra, "main", lambda **_: lambda job: become_portable)
     monkeypatch.delenv("HYDRA_FULL_ERROR")
     before = dict(os.environ)
 

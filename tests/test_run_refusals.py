@@ -65,6 +65,30 @@ REFUSED = [
         ["~curriculum.num_frames", "~curriculum.image_seed", "curriculum._target_=os.remove", "+curriculum.path=a"],
         ["error: Target 'os.remove'"],
     ),
+    (
+        ["seed=${oc.env:NOT_SET}"],
+        [
+            "error: seed=${oc.env:NOT_SET}: Environment variable 'NOT_SET' not found; set it",
+            "${oc.env:NOT_SET,VALUE}\n",
+        ],
+    ),
+    (
+        ["agent=${oc.env:NOT_SET}"],
+        ["error: agent=${oc.env:NOT_SET}: Environment variable 'NOT_SET' not found; set it, or write what"],
+    ),
+    (["together=${nope:1}"], ["error: together=${nope:1}: there is no resolver nope; write the value itself\n"]),
+    (["agent.gamma=${nokey}"], ["error: agent.gamma=${nokey}: Interpolation key 'nokey' not found; write the value"]),
+    (["seed=???"], ["error: seed=??? has no value: ??? stands for one that must be given; give it, or leave seed out"]),
+    (["agent.gamma=???"], ["error: agent.gamma=??? has no value"]),
+    (["hydra.run.dir=???"], ["error: hydra.run.dir=??? has no value"]),
+    (["hydra.run.dir=${nope:1}"], ["error: hydra.run.dir=${nope:1}: there is no resolver nope"]),
+    (["agent=???"], ["error: agent=??? names no file: name one, such as agent=NAME, or leave agent out\n"]),
+    (["~seed"], ["error: ~seed removes seed, which every run needs: leave ~seed out\n"]),
+    (["~method"], ["error: ~method removes method, which every run needs: leave ~method out\n"]),
+    (["~agent"], ["error: ~agent removes agent, which every run needs: leave ~agent out\n"]),
+    (["~seed=1"], ["error: ~seed=1 removes seed only where it is 1, and it is 0: leave ~seed=1 out\n"]),
+    (["~objective"], ["error: ~objective removes what has no value: leave ~objective out\n"]),
+    (["~agent=1"], ["error: ~agent=1 removes a group by a value that no file of it has: leave ~agent=1 out\n"]),
     (["seed="], ["seed must be an integer in [0, 2**63), got ''"]),
 ]
 
@@ -81,6 +105,7 @@ def test_a_wrong_value_is_one_message_and_exit_code_1_and_leaves_no_file_and_no_
     assert code == 1
     assert all(part in error for part in said), error
     assert "Traceback" not in error and "Error executing job" not in error
+    assert error.count("\n") <= 5
     assert list(tmp_path.iterdir()) == []
 
 

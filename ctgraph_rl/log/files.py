@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -173,6 +173,16 @@ def _signed(file: BinaryIO) -> BinaryIO:
     with suppress(OSError):
         file.write(f"{_signature()}since {now}".encode())
     return file
+
+
+OF_A_SWEEP = ("multirun.yaml", "optimization_results.yaml")
+"""What Hydra's sweepers leave beside run directories, and ``SWEEP/*`` names on a command line."""
+
+
+def without_sweeps_files(paths: Iterable[Path | str]) -> list[Path]:
+    """Return the paths of a command line but for Hydra's own files of a sweep; these too if there is nothing else."""
+    every = list(map(Path, paths))
+    return [path for path in every if path.name not in OF_A_SWEEP or path.is_dir()] or every
 
 
 def no_run(path: Path) -> str:

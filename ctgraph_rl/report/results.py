@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -12,7 +12,7 @@ from statistics import fmean
 from typing import Any
 
 from ctgraph_rl import metrics, parsers
-from ctgraph_rl.checks import positive, require
+from ctgraph_rl.checks import nearest, positive, require
 from ctgraph_rl.disk import write_named
 from ctgraph_rl.learn.progress import Count, StepCounter, silent
 from ctgraph_rl.log.escape import csv_text
@@ -159,12 +159,12 @@ def comparisons(runs: Sequence[Run], metric: str) -> dict[tuple[str, str, str], 
     """Every pair of agents on the same curriculum and seeds, by (curriculum, first, second), with corrected p.
 
     Raises:
-        ValueError: if no run has the metric; lists those that there are.
+        ValueError: if no run has the metric.
     """
     choices: dict[str, None] = {}
     for run in runs:
         choices |= dict.fromkeys(run.metrics)
-    require((metric in choices, f"no run has a metric {metric!r}; there are: {', '.join(choices) or 'none'}"))
+    require((metric in choices, _no_measure([metric], choices)))
     found = {}
     bounds = bounds_by_curriculum(runs)
     for (first, one), (second, other) in combinations(grouped(runs).items(), 2):
@@ -194,7 +194,7 @@ def selected(rows: Sequence[Row], names: Sequence[str] | None = None, also: Sequ
         also: measures that are shown with `SHOWN`.
 
     Raises:
-        ValueError: for a name that no row has; lists those that there are.
+        ValueError: for a name that no row has.
     """
     choices: dict[str, None] = {}
     with_value = set()
@@ -204,11 +204,22 @@ def selected(rows: Sequence[Row], names: Sequence[str] | None = None, also: Sequ
         if row.measure in WHERE_KNOWN and row.estimate.n:
             with_value.add((row.curriculum, row.measure))
     unknown = [name for name in names or () if name not in choices]
-    message = f"no run has a measure {', '.join(map(repr, unknown))}; there are: {', '.join(choices) or 'none'}"
-    require((not choices or not unknown, message))
+    require((not choices or not unknown, _no_measure(unknown, choices)))
     always = (*SHOWN, *also, NO_RUN_FINISHED) if names is None else (*names, NO_RUN_FINISHED)
     further = with_value if names is None else ()
     return [row for row in rows if row.kind in always or (row.curriculum, row.measure) in further]
+
+
+def _no_measure(unknown: Sequence[str], choices: Iterable[str]) -> str:
+    """Return why measures cannot be shown, and what to do, about a user's own metric too."""
+    known = list(choices)
+    near = [nearest(name, known) for name in unknown]
+    meant = ", ".join(dict.fromkeys(filter(None, near)))
+    hint = f"did you mean {meant}?" if meant else f"there are {len(known)}, such as {', '.join(known[:4])}"
+    own = "of your own, import its module in your agent's module or training script, and run again"
+    return (
+        f"no run has a measure {', '.join(map(repr, unknown))}: {hint}; to have one {own} (docs/how-to/own_metric.md)"
+    )
 
 
 def write_csv(path: Path | str, rows: Sequence[Row]) -> None:

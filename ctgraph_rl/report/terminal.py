@@ -20,7 +20,7 @@ from ctgraph_rl.log.escape import listed, terminal_text
 from ctgraph_rl.log.provenance import numbers_of
 from ctgraph_rl.report.formats import measure_name
 from ctgraph_rl.report.names import modification
-from ctgraph_rl.runs.read import Curve, History, Problem, Run, code_of, read_run
+from ctgraph_rl.runs.read import FOLDER, Curve, History, Problem, Run, code_of, read_run
 from ctgraph_rl.runs.settings import as_before
 
 ALWAYS = ("average_performance", "forward_transfer", "backward_transfer", "forgetting")
@@ -188,17 +188,18 @@ def metrics_table(metrics: Mapping[str, ReadOnlyValues]) -> Table:
 
 def mixed_code(runs: Iterable[Run]) -> list[str]:
     """Return a sentence on every configuration that was run with different code, whose runs are shown apart."""
-    of: dict[str, dict[tuple[str, str, str], list[Run]]] = {}
+    of: dict[str, dict[tuple[str, str], list[Run]]] = {}
     for run in runs:
         config = {**as_before(run.about["config"]), "seed": 0}
-        how = json.dumps([config, None if "curriculum" in config else run.group], sort_keys=True)
+        learner = [run.agent, run.settings.get(FOLDER), None if "curriculum" in config else run.group]
+        how = json.dumps([config, learner], sort_keys=True)
         of.setdefault(how, {}).setdefault(_state(run), []).append(run)
     return [_sentence(list(some.values())) for some in of.values() if len(some) > 1]
 
 
-def _state(run: Run) -> tuple[str, str, str]:
+def _state(run: Run) -> tuple[str, str]:
     (_, fingerprint), _, code = run.configuration
-    return run.agent or str(run.path.resolve()), fingerprint, code
+    return fingerprint, code
 
 
 def _sentence(states: Sequence[Sequence[Run]]) -> str:
@@ -209,7 +210,9 @@ def _sentence(states: Sequence[Sequence[Run]]) -> str:
         said = [f"fingerprint {some[0].group[1]}"] * fingerprints + [code_of(some[0], every)]
         seeds = listed(sorted(run.seed for run in some), MOST_SEEDS)
         parts.append(f"seed{'s' * (len(some) > 1)} {seeds} ({', '.join(filter(None, said))})")
-    who = f"{every[0].agent or every[0].path} on {every[0].group[0]} was run with different code, shown apart"
+    who = (
+        f"{every[0].agent or every[0].settings[FOLDER]} on {every[0].group[0]} was run with different code, shown apart"
+    )
     return f"{who}: {'; '.join(parts)}; overwrite=stale runs what is stale again"
 
 

@@ -25,7 +25,7 @@ from hydra.types import RunMode
 from hydra.version import VersionBase
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.basecontainer import BaseContainer
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from ctgraph_rl.checks import (
     Function,
@@ -65,6 +65,16 @@ SAID = (
         "{0} has several values: add -m to run each; a list is written in brackets, a text in quotes",
     ),
     (re.compile(r"Sweep parameters '(\S+?)=.*' requires --multirun"), "{0} has several values: add -m to run each"),
+    (re.compile(r"You must specify '(\S+)', e"), "{0}=??? names no file: name one, such as {0}=NAME, or leave {0} out"),
+    (
+        re.compile(r"Config group override deletion value must be a string.*input_line='(.+?)'", re.DOTALL),
+        "{0} removes a group by a value that no file of it has: leave {0} out",
+    ),
+    (
+        re.compile(r"Could not delete from config\. The value of '(\S+)' is (.+) and not (.+)\.", re.DOTALL),
+        "~{0}={2} removes {0} only where it is {2}, and it is {1}: leave ~{0}={2} out",
+    ),
+    (re.compile(r"Could not delete from config\. '(\S+)' does"), "~{0} removes what has no value: leave ~{0} out"),
     (re.compile(r"Multiple values for (\S+)\. To override .*'override \S+: (.*)'"), "{0} has a value: write {0}={1}"),
 )
 """Beginnings of messages of Hydra, and what is said in their place."""
@@ -102,6 +112,13 @@ def plain(cfg: DictConfig) -> NamedValues:
     """Return the configuration as plain values, without Hydra's own and what does not change results."""
     kept = [str(key) for key in cfg if key != "hydra" and key not in NOT_HASHED]
     return OmegaConf.to_container(OmegaConf.masked_copy(cfg, kept), resolve=True)  # type: ignore[return-value]
+
+
+def _unresolved(cfg: DictConfig) -> NamedValues:
+    """Return a configuration without Hydra's own as plain values, with unresolved interpolations."""
+    values: NamedValues = OmegaConf.to_container(cfg, resolve=False)  # type: ignore[assignment]
+    values.pop("hydra", None)
+    return values
 
 
 def run_name(*, _root_: DictConfig) -> str:
@@ -161,10 +178,12 @@ def of_member(cfg: DictConfig, number: int, settings: ReadOnlyValues) -> DictCon
     return own
 
 
-if IS_NEXT_HYDRA:
-    OmegaConf.register_resolver("run_name", run_name, replace=True)  # type: ignore[call-arg]
-else:
-    OmegaConf.register_new_resolver("run_name", run_name, replace=True)
+def register_run_name() -> None:
+    """Let ``${run_name:}`` of a configuration be `run_name`, in this process."""
+    if IS_NEXT_HYDRA:
+        OmegaConf.register_resolver("run_name", run_name, replace=True)  # type: ignore[call-arg]
+    else:
+        OmegaConf.register_new_resolver("run_name", run_name, replace=True)
 
 
 def in_sweep() -> bool:
@@ -181,6 +200,7 @@ def check_one_cell() -> None:
     if in_sweep():
         return
     chosen = HydraConfig.get()
+    _ = chosen.run.dir  # one that is ??? would be a directory None
     swept = {**(chosen.sweeper.get("params") or {})}
     for variant in chosen.sweeper.get("variants") or ():
         swept |= dict.fromkeys(variant, "...")
@@ -195,16 +215,25 @@ def check_one_cell() -> None:
     )
 
 
-def check_values(cfg: DictConfig) -> None:
-    """Refuse values of the run's own keys.
+def check_resolved(cfg: DictConfig) -> None:
+    """Refuse a configuration with a setting that has no value: ``???``, or what no resolver finds.
+
+    Raises:
+        OmegaConfBaseException: names the setting; see `explain`.
+    """
+    for key in cfg:
+        value = None if key == "hydra" else cfg[key]
+        if OmegaConf.is_config(value):
+            OmegaConf.to_container(value, resolve=True, throw_on_missing=True)
+
+
+def check_settings(cfg: DictConfig) -> None:
+    """Refuse values of the run's own keys that are out of range on every machine.
 
     Raises:
         ValueError: for one out of range.
     """
     require((is_int(cfg.seed, 0, 2**63 - 1), f"seed must be an integer in [0, 2**63), got {cfg.seed!r}"))
-    cores = os.cpu_count() or 1
-    threads_rule = f"num_threads must be in 1..{cores}, the cores of this machine, got {cfg.num_threads!r}"
-    require((is_int(cfg.num_threads, 1, cores), threads_rule))
     folder = cfg.experts_dir
     require((isinstance(folder, str) and bool(folder), f"experts_dir must be the path of a folder, got {folder!r}"))
     for switch in ("experts", "report", "portable", "together"):
@@ -216,6 +245,18 @@ def check_values(cfg: DictConfig) -> None:
         *one_of(RESUME, resume=cfg.resume),
         *positive(checkpoint_seconds=cfg.checkpoint_seconds),
     )
+
+
+def check_values(cfg: DictConfig) -> None:
+    """Refuse values of the run's own keys, for this machine too.
+
+    Raises:
+        ValueError: for one out of range.
+    """
+    check_settings(cfg)
+    cores = os.cpu_count() or 1
+    threads_rule = f"num_threads must be in 1..{cores}, the cores of this machine, got {cfg.num_threads!r}"
+    require((is_int(cfg.num_threads, 1, cores), threads_rule))
     if cfg.portable:
         check_portable()
         compiled = "portable=true needs agent.compile=false: compiled code is made for the CPU of this machine"
@@ -320,6 +361,7 @@ def _hydra_of_its_own() -> Iterator[None]:
         singletons = {kind: Singleton._instances.pop(kind) for kind in RENEWED if kind in Singleton._instances}
         resolvers = dict(BaseContainer._resolvers)
         try:
+            register_run_name()
             yield
         finally:
             for kind in RENEWED:
@@ -382,9 +424,11 @@ def explain(error: BaseException, cfg: DictConfig | None = None) -> str:
     cause = error
     while cause.__cause__ is not None and not _says_what_to_do(cause):
         cause = cause.__cause__
+    if isinstance(cause, OmegaConfBaseException):
+        return _of_omegaconf(_first(cause), str(error).strip())
     if cfg is not None and isinstance(cause, ValueError):
         typed = (setting.partition("=")[0].lstrip("+~") for setting in HydraConfig.get().overrides.task)
-        return as_typed(str(cause).strip(), plain(cfg), typed)
+        return as_typed(str(cause).strip(), _unresolved(cfg), typed)
     if isinstance(cause, MissingConfigException) and cause.missing_cfg_file:
         group, _, name = cause.missing_cfg_file.rpartition("/")
         return _unknown_file(group, name, cause.options or ())
@@ -392,11 +436,61 @@ def explain(error: BaseException, cfg: DictConfig | None = None) -> str:
         is_value = "=" in str(cause.override)
         how = "quote a value with brackets, commas or spaces" if is_value else "settings are written as in seed=1"
         return f"cannot read {cause.override!r}: {how}"
-    node = getattr(cause, "parent_node", None)
-    if isinstance(node, DictConfig):
-        return _unknown_setting(str(getattr(cause, "full_key", "")), node)
-    message = str(error if isinstance(cause, OmegaConfBaseException) else cause).strip()
+    message = str(cause).strip()
+    chosen = re.match(r"Error resolving interpolation '(.*)', possible", message)
+    if chosen is not None:
+        return _unresolved_choice(chosen[1])
     return next((text.format(*found.groups()) for rule, text in SAID if (found := rule.match(message))), message)
+
+
+def _first(error: OmegaConfBaseException) -> OmegaConfBaseException:
+    """Return the error that others of OmegaConf were made of, such as one of a setting that a name is made of."""
+    first = error
+    each: BaseException | None = error
+    while isinstance(each, OmegaConfBaseException):
+        first = each if each.full_key else first
+        each = each.__context__
+    return first
+
+
+def _of_omegaconf(error: OmegaConfBaseException, message: str) -> str:
+    """Return what is wrong with a setting: its name, its value as it was typed, why, and what to do.
+
+    Args:
+        error: what is said of it.
+        message: what is said where the error does not tell of a setting.
+    """
+    key = str(error.full_key or "")
+    if not isinstance(error.parent_node, DictConfig) or not key:
+        return message
+    group, _, name = key.rpartition(".")
+    root = error.parent_node._get_root()
+    holder = OmegaConf.select(root, group) if group else root
+    if not isinstance(holder, DictConfig) or name not in set(holder):  # ``in`` of OmegaConf denies what has no value
+        return _unknown_setting(key, error.parent_node)
+    if isinstance(error, MissingMandatoryValue):
+        return f"{key}=??? has no value: ??? stands for one that must be given; give it, or leave {key} out"
+    raw = holder._get_node(name)._value()  # type: ignore[union-attr]
+    return f"{key}={raw}: {_why_unresolved(str(error), str(raw))}"
+
+
+def _unresolved_choice(raw: str) -> str:
+    """Return why the choice of a group's file has no value; Hydra does not say of which group."""
+    setting = next((word for word in sys.argv if word.endswith(f"={raw}")), raw)
+    try:
+        OmegaConf.to_container(OmegaConf.create({"choice": raw}), resolve=True)
+    except OmegaConfBaseException as error:
+        return f"{setting}: {_why_unresolved(str(error), raw)}"
+    return f"{setting}: a group is chosen by the name of a file; write the name itself"
+
+
+def _why_unresolved(message: str, raw: str) -> str:
+    """Return why OmegaConf finds no value for a text, and what to do."""
+    why = message.partition("\n")[0].rpartition("raised while resolving interpolation: ")[2].strip('"')
+    why = why.replace("Unsupported interpolation type", "there is no resolver")
+    if "nvironment variable" in why:
+        return f"{why}; set it, or write what it is where it is not set, {raw.replace('}', ',VALUE}', 1)}"
+    return f"{why}; write the value itself"
 
 
 def _unknown_file(group: str, name: str, choices: Sequence[str]) -> str:
@@ -412,13 +506,21 @@ def _unknown_file(group: str, name: str, choices: Sequence[str]) -> str:
 def _unknown_setting(asked: str, node: DictConfig) -> str:
     """Return why a setting is none, and what was probably meant: a key beside it or, of the whole run, any below."""
     group, _, key = asked.rpartition(".")
+    if group == "hydra.runtime.choices" and len(node):
+        return _removed(key)
     beside = [f"{group}.{name}".lstrip(".") for name in map(str, node) if name not in _NO_SETTINGS]
     groups = [] if group else [path.name for path in Path(conf_dir()).iterdir() if path.is_dir()]
-    below = [] if group else [name for name, _ in flat(plain(node))]
+    below = [] if group else [name for name, _ in flat(_unresolved(node))]
+    if not group and key in (*groups, *OmegaConf.load(Path(conf_dir(), "config.yaml"))):
+        return _removed(key)
     ends = {name.rpartition(".")[2]: name for name in (*reversed(below), *groups, *beside)}  # the last one counts
     near = nearest(key, set(ends) - _NO_SETTINGS)
     hint = f"choices: {', '.join(beside) or 'none'}" if near is None else f"did you mean {ends[near]!r}?"
     return f"unknown setting {asked!r}: {hint}"
+
+
+def _removed(key: str) -> str:
+    return f"~{key} removes {key}, which every run needs: leave ~{key} out"
 
 
 def _says_what_to_do(error: BaseException) -> bool:

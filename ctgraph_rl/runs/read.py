@@ -1,6 +1,7 @@
 """Run directories as data: each log is read once, and only what tables and figures need is kept of it.
 
-Runs of one configuration but for the seed belong together; one that names no agent is shown apart, by its directory.
+Runs of one configuration but for the seed belong together. Those in one folder that name no agent are one learner with
+the name of the folder.
 A directory that cannot be read is a `Problem` with its reason, and never a number.
 """
 
@@ -20,7 +21,7 @@ from ctgraph_rl.disk import read_regular
 from ctgraph_rl.learn.labels import Span, label_spans
 from ctgraph_rl.learn.progress import Count, silent
 from ctgraph_rl.log.damage import metrics_of
-from ctgraph_rl.log.files import FAILURE, LOG, METRICS, MOST_BYTES_OF_METRICS, no_run
+from ctgraph_rl.log.files import FAILURE, LOG, METRICS, MOST_BYTES_OF_METRICS, no_run, without_sweeps_files
 from ctgraph_rl.log.measurement import check, parsed
 from ctgraph_rl.log.run_log import MOST_BYTES, SCHEMA, RunLog, label_of
 from ctgraph_rl.log.sources import is_ours, targets
@@ -41,6 +42,9 @@ ABOUT = ("curriculum", "fingerprint", "config")
 
 NO_METHOD = "Finetune"
 """The method that changes nothing: a run with it and one without a method have the same configuration."""
+
+FOLDER = "folder"
+"""Setting of a run that names no agent: all of these in one folder are one learner."""
 
 MOST_MODULES = 3
 """Modules that differ between runs that else are alike and are named; one digest stands for all others."""
@@ -86,8 +90,8 @@ class Run:
         path: the directory.
         about: the first line of its log.
         agent: class or name of the learner, ``PPO + EWC`` with a method; None if the configuration does not say.
-        settings: the configuration without the seed and what the fingerprint covers, by dotted keys; the directory
-            with them if there is no agent.
+        settings: the configuration without the seed and what the fingerprint covers, by dotted keys; the folder that
+            the directory is in with them if there is no agent.
         seed: the seed.
         reason: why it has no results; None for a finished run.
         metrics: `Metric` fields by name; empty without results, as are the next three.
@@ -179,11 +183,11 @@ def find_runs(paths: Iterable[Path | str], count: Count = silent) -> tuple[list[
     problems: list[Problem] = []
     refused: dict[Path, Path] = {}
     every = []
-    for path in paths:
-        files, deep = files_below(Path(path), (LOG, FAILURE))
+    for path in without_sweeps_files(paths):
+        files, deep = files_below(path, (LOG, FAILURE))
         problems += map(Problem, deep, map(too_deep, deep))
         if not files:
-            problems.append(Problem(Path(path), no_run(Path(path))))
+            problems.append(Problem(path, no_run(path)))
         every += files
     for done, file in enumerate(every, 1):
         try:
@@ -200,8 +204,17 @@ def find_runs(paths: Iterable[Path | str], count: Count = silent) -> tuple[list[
     for key, run in [each for each in found if each[1].group[0] != EXPERT] or found:
         twin = runs.setdefault(key, run)
         if twin.path.resolve() != run.path.resolve():
-            problems.append(Problem(run.path, f"{twin.path} and {run.path} are one run twice; the second is left out"))
+            problems.append(Problem(run.path, _twice(twin, run)))
     return list(runs.values()), problems
+
+
+def _twice(first: Run, second: Run) -> str:
+    """Return why the second of two runs of one learner and seed is left out."""
+    both = f"{first.path} and {second.path} are"
+    if first.agent is not None:
+        return f"{both} one run twice; the second is left out"
+    name = 'learners need names, such as Recorder(..., about={"learner": "NAME"}), or separate folders'
+    return f"{both} both seed {first.seed} of the learner of {first.settings[FOLDER]}, the second is left out: {name}"
 
 
 def read_run(path: Path) -> Run:
@@ -223,7 +236,7 @@ def read_run(path: Path) -> Run:
     agent = _agent(config)
     settings = dict(flat(config))
     if agent is None:
-        settings["directory"] = str(path.resolve())
+        settings[FOLDER] = str(path.resolve().parent)
     try:
         log = RunLog.read(file)
         history = _history(log)
@@ -440,4 +453,4 @@ def _differing(runs: Sequence[Run]) -> list[str]:
 
 
 def _name(run: Run) -> str:
-    return run.path.resolve().name if run.agent is None else run.agent
+    return Path(run.settings[FOLDER]).name if run.agent is None else run.agent

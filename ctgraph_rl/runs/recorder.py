@@ -58,7 +58,7 @@ class Recorder:
 
     Use it as a context manager, or call `close`::
 
-        with Recorder(curriculum, "runs/mine", resume=True) as recorder:
+        with Recorder(curriculum, "runs/mine/0", resume=True) as recorder:
             if recorder.saved is None:
                 recorder.evaluate(policy, 0)
             else:
@@ -74,7 +74,9 @@ class Recorder:
         curriculum: what is learned.
         run_dir: where the files of a run go, all but ``agent.pt``; None: measurements stay in ``log``.
         seed: of the run; evaluations derive theirs from it, in [0, 2**63).
-        about: what else the first line of the log should tell, such as the learner's name and settings, as JSON.
+        about: what else the first line of the log should tell, such as the learner's name and settings, as JSON:
+            ``{"learner": "SAC", "learning_rate": 0.01}``. Runs in one folder that name no learner are one learner, with
+            the folder's name.
         code: classes and functions that learn; the log then says of which source they are, so that results of changed
             code are not averaged with those of before. None: it does not say.
         overwrite: replace the run that the directory holds.

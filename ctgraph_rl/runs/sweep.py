@@ -26,7 +26,7 @@ from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CHECKPOINTS, member_folder
 from ctgraph_rl.packages import check_packages, conf_dir
 from ctgraph_rl.portable import become_portable
-from ctgraph_rl.runs.config import check_overwrite, explain, of_member, save_yaml
+from ctgraph_rl.runs.config import check_overwrite, check_resolved, check_settings, explain, of_member, save_yaml
 from ctgraph_rl.runs.status import (
     DONE,
     MISSING,
@@ -197,7 +197,8 @@ class Sweeper(Base):
         composed.
 
         Raises:
-            ValueError: if directories are not named after the configuration.
+            ValueError: if directories are not named after the configuration, and for a seed or another of the run's own
+                values that is out of range.
             HydraException: for what cannot be composed.
         """
         assert self.config is not None and self.hydra_context is not None
@@ -217,8 +218,10 @@ class Sweeper(Base):
             alike = tuple(choices), tuple(values)
             if alike not in composed:
                 composed[alike] = self._composed(overrides, choices)
+                check_resolved(composed[alike])
             for key, value in values.items():
                 OmegaConf.update(composed[alike], key, value)
+            check_settings(composed[alike])
             sweep = composed[alike].hydra.sweep
             folder = Path(sweep.dir).absolute() / sweep.subdir
             if folder not in found and self.config.overwrite is not True:
@@ -321,7 +324,7 @@ class Sweeper(Base):
             try:
                 returned = self.launcher.launch(list(map(list, batch)), initial_job_idx=first)
             except Exception as error:  # such as a worker that was killed: the cells' directories say how far they are
-                print(f"the launcher stopped: {type(error).__name__}: {terminal_text(error)}", file=sys.stderr)
+                print(f"the launcher stopped: {type(error).__name__}: {terminal_text(explain(error))}", file=sys.stderr)
                 return
             for of_job, job in zip(batch, returned, strict=True):
                 if job.status == JobStatus.FAILED:

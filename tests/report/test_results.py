@@ -11,13 +11,13 @@ import torch
 from helpers.made_runs import all_runs, line, make_run
 from helpers.scripted import DECISION_ID, ONE, TWO, curriculum
 
-from ctgraph_rl import Block, metrics, parsers
+from ctgraph_rl import Block, Recorder, metrics, parsers
 from ctgraph_rl.log.run_log import write_metrics
 from ctgraph_rl.report import formats, results
-from ctgraph_rl.report.results import comparisons, selected, table
+from ctgraph_rl.report.results import comparisons, rows_by_seed, selected, table
+from ctgraph_rl.report.terminal import mixed_code
 from ctgraph_rl.runs.experts import EXPERT
-from ctgraph_rl.runs.read import Problem, find_runs, grouped
-from ctgraph_rl.runs.recorder import Recorder
+from ctgraph_rl.runs.read import Problem, find_runs, grouped, why_left_out
 
 pytest.importorskip("scipy")
 
@@ -207,7 +207,7 @@ def test_runs_of_different_curricula_are_not_compared(tmp_path):
 def test_an_unknown_metric_lists_those_that_there_are(tmp_path):
     make_run(tmp_path, 0)
 
-    with pytest.raises(ValueError, match="no run has a metric 'accuracy'; there are: average_performance, "):
+    with pytest.raises(ValueError, match="no run has a measure 'accuracy': there are "):
         comparisons(all_runs([tmp_path]), "accuracy")
 
 
@@ -362,29 +362,45 @@ def record(path, **config):
     made.rename(path)
 
 
-@pytest.mark.parametrize("seeds", [(0, 1), (0, 0)])
-def test_runs_that_name_no_agent_are_one_row_each_under_their_directory(tmp_path, seeds):
+def test_runs_in_one_folder_that_name_no_agent_are_one_learner_with_its_name(tmp_path, monkeypatch, capsys):
+    learned = curriculum(Block(ONE, 12), Block(TWO, 12))
+    for name, count in (("mine", 3), ("yours", 2)):
+        for seed in range(count):
+            with Recorder(learned, tmp_path / f"runs/{name}/{seed}", seed) as recorder:
+                for frames in (0, *learned.ends):
+                    recorder.evaluate(lambda images: images[:, DECISION_ID].astype(int), frames)
+
+    runs, problems = find_runs([tmp_path])
+    rows = [row for row in table(runs) if row.measure == "average_performance"]
+
+    assert problems == [] and mixed_code(runs) == []
+    assert {row.agent: row.estimate.n for row in rows} == {"mine": 3, "yours": 2}
+    assert {row.agent: row.seed for row in rows_by_seed(runs)} == {"mine": 2, "yours": 1}
+    shown_by(monkeypatch, capsys, str(tmp_path))  # exit code 0
+
+
+def test_one_seed_twice_in_a_folder_of_a_learner_without_a_name_is_left_out_with_the_fix(tmp_path):
     make_run(tmp_path, 2)
-    for name, seed in zip(("mine", "yours"), seeds, strict=True):
-        record(tmp_path / name, seed=seed)
+    for name in ("mine", "yours"):
+        record(tmp_path / name, seed=0)
 
-    rows = [row for row in table(all_runs([tmp_path])) if row.measure == "average_performance"]
+    runs, problems = find_runs([tmp_path])
 
-    assert {row.agent: (row.estimate.n, row.estimate.n_undefined) for row in rows} == {
-        "PPO": (1, 0),
-        "mine": (1, 0),
-        "yours": (1, 0),
-    }
+    assert sorted((run.agent or "", run.seed) for run in runs) == [("", 0), ("PPO", 2)]
+    assert why_left_out(problems) == (
+        f"{tmp_path}/mine and {tmp_path}/yours are both seed 0 of the learner of {tmp_path}, the second is left out: "
+        'learners need names, such as Recorder(..., about={"learner": "NAME"}), or separate folders'
+    )
 
 
-def test_directories_of_one_name_are_told_apart(tmp_path):
+def test_folders_of_one_name_are_told_apart(tmp_path):
     for folder in ("a", "b"):
-        (tmp_path / folder).mkdir()
-        record(tmp_path / folder / "run", seed=0)
+        (tmp_path / folder / "run").mkdir(parents=True)
+        record(tmp_path / folder / "run" / "0", seed=0)
 
     agents = {row.agent for row in table(all_runs([tmp_path]))}
 
-    assert agents == {f"run directory={(tmp_path / folder / 'run').resolve()}" for folder in ("a", "b")}
+    assert agents == {f"run folder={(tmp_path / folder / 'run').resolve()}" for folder in ("a", "b")}
 
 
 @pytest.mark.parametrize("key", ["agent", "learner"])
@@ -448,3 +464,14 @@ def test_a_log_of_one_line_is_an_unfinished_run_beside_a_finished_one(tmp_path):
         ("PPO gamma=0.5", "forgetting", "0.00 n = 1"),
         ("PPO gamma=0.9", "every_metric", "- n = 0/1"),
     ]
+
+
+@pytest.mark.parametrize("name", ["multirun.yaml", "optimization_results.yaml"])
+def test_the_files_that_hydra_leaves_in_a_sweep_are_no_runs_without_results(tmp_path, name):
+    run_dir = make_run(tmp_path, 0)
+    (tmp_path / name).touch()
+    (tmp_path / "notes.txt").touch()
+
+    assert find_runs([run_dir, tmp_path / name])[1] == []
+    assert "notes.txt holds no run" in find_runs([run_dir, tmp_path / "notes.txt"])[1][0].reason
+    assert f"{name} holds no run" in find_runs([tmp_path / name])[1][0].reason

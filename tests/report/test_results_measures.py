@@ -56,13 +56,23 @@ def test_five_measures_are_shown_and_of_the_gap_of_memory_and_against_experts_th
     assert [row.measure for row in selected(rows, ["solved", "regret"])] == ["regret", "solved goal1", "solved goal2"]
 
 
-def test_an_unknown_measure_lists_those_that_there_are(tmp_path):
+def test_an_unknown_measure_names_a_near_one_and_how_to_have_one_of_ones_own(tmp_path):
     make_run(tmp_path, 0)
+    rows = table(all_runs([tmp_path]))
+    own = (
+        "to have one of your own, import its module in your agent's module or training script, and run again "
+        "(docs/how-to/own_metric.md)"
+    )
 
-    with pytest.raises(
-        ValueError, match=r"no run has a measure 'accuracy'; there are: average_performance, .*, solved$"
-    ):
-        selected(table(all_runs([tmp_path])), ["accuracy", "forgetting"])
+    with pytest.raises(ValueError) as unknown:
+        selected(rows, ["accuracy", "forgetting"])
+    with pytest.raises(ValueError) as misspelt:
+        selected(rows, ["forgeting"])
+
+    few = ", ".join(dict.fromkeys(row.kind for row in rows[:4]))
+    count = len({row.kind for row in rows})
+    assert str(unknown.value) == f"no run has a measure 'accuracy': there are {count}, such as {few}; {own}"
+    assert str(misspelt.value) == f"no run has a measure 'forgeting': did you mean forgetting?; {own}"
 
 
 def test_tables_for_papers_have_a_line_for_each_measure(tmp_path):

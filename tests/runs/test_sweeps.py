@@ -76,24 +76,39 @@ def test_a_sweep_that_is_done_ends_with_its_table_and_what_to_do_next(tmp_path, 
 
 
 def test_a_failing_cell_stops_no_other_and_is_tried_again(learned, monkeypatch, capsys):
-    codes = [sweep(monkeypatch, f"seed=0,{UNLUCKY},-1,2") for _ in range(2)]
+    codes = [sweep(monkeypatch, f"seed=0,{UNLUCKY},2") for _ in range(2)]
 
     shown, errors = capsys.readouterr()
     assert codes == [1, 1] and errors == ""
     assert [path.name.split("-")[1] for path in learned] == ["seed0", f"seed{UNLUCKY}", "seed2", f"seed{UNLUCKY}"]
     lines = shown.splitlines()
-    assert lines[:3] == [
-        "sweep of 4 cells: 2 done, 2 failed, 0 in use, 0 missing",
+    assert lines[:2] == [
+        "sweep of 3 cells: 2 done, 1 failed, 0 in use, 0 missing",
         f"  failed   seed={UNLUCKY}  FloatingPointError: the loss is NaN",
-        "  failed   seed=-1  ValueError: seed must be an integer in [0, 2**63), got -1",
     ]
-    assert lines[3].startswith("the same command runs what is not done")
-    (refused,) = Path("runs").rglob("*-seed_1-*")
-    (mark,) = refused.iterdir()
-    assert (mark.name, mark.read_text()) == (
-        "failed.txt",
-        "ValueError: seed must be an integer in [0, 2**63), got -1\n",
-    )
+    assert lines[2].startswith("the same command runs what is not done")
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        (["seed=0,x"], "seed must be an integer in [0, 2**63), got 'x'"),
+        (["seed=0,-1"], "seed must be an integer in [0, 2**63), got -1"),
+        (["seed=0,1", "resume=warn,never"], "resume must be one of warn, strict, got 'never'"),
+        (["seed=0,1", "objective=???"], "objective=??? has no value: ??? stands for one that must be given"),
+        (
+            ["seed=0,1", "agent.gamma=${oc.env:NOT_SET}"],
+            "agent.gamma=${oc.env:NOT_SET}: Environment variable 'NOT_SET'",
+        ),
+    ],
+)
+def test_a_value_that_no_run_can_have_is_refused_before_any_cell_is_trained(
+    learned, monkeypatch, capsys, settings, said
+):
+    assert sweep(monkeypatch, *settings) == 1
+
+    assert capsys.readouterr().err.startswith(f"error: {said}")
+    assert learned == [] and not Path("runs").exists()
 
 
 def test_status_runs_nothing_and_knows_why_cells_failed(learned, monkeypatch, capsys):
@@ -114,7 +129,8 @@ def test_status_runs_nothing_and_knows_why_cells_failed(learned, monkeypatch, ca
 def test_status_names_every_cell_and_the_end_of_a_sweep_the_first(learned, monkeypatch, capsys):
     monkeypatch.setattr("ctgraph_rl.runs.sweep.SHOWN", 2)
 
-    said = [sweep(monkeypatch, "seed=range(-4,0)", f"hydra.sweeper.status={status}") for status in ("true", "false")]
+    cells = (f"seed={UNLUCKY}", "agent.gamma=0.1,0.2,0.3,0.4")
+    said = [sweep(monkeypatch, *cells, f"hydra.sweeper.status={status}") for status in ("true", "false")]
 
     lines = capsys.readouterr().out.splitlines()
     assert said == [1, 1]
@@ -281,14 +297,23 @@ def test_lists_and_dictionaries_can_be_swept(learned, monkeypatch):
 @pytest.mark.slow
 def test_a_sweep_on_processes_runs_every_cell_and_shows_no_bars(checkout, tmp_path):
     pytest.importorskip("joblib")
-    command = [sys.executable, "-m", "ctgraph_rl.run", "-m", "hydra/launcher=joblib", *SHORT, "seed=0,-1,1"]
+    command = [
+        sys.executable,
+        "-m",
+        "ctgraph_rl.run",
+        "-m",
+        "hydra/launcher=joblib",
+        *SHORT,
+        "seed=0,1",
+        "agent.gamma=0.9,2",
+    ]
     env = {**os.environ, "PYTHONPATH": str(checkout)}
     result = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True)
 
     assert (result.returncode, result.stderr) == (1, "")
     assert result.stdout.splitlines()[:2] == [
-        "sweep of 3 cells: 2 done, 1 failed, 0 in use, 0 missing",
-        "  failed   seed=-1  ValueError: seed must be an integer in [0, 2**63), got -1",
+        "sweep of 4 cells: 2 done, 2 failed, 0 in use, 0 missing",
+        "  failed   seed=0 agent.gamma=2  ValueError: agent.gamma must be in [0, 1], got 2",
     ]
     assert len(list(tmp_path.glob("runs/*/*/agent.pt"))) == 2
 
