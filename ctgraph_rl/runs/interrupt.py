@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
@@ -52,13 +55,20 @@ class Interrupt:
             self.exit()
 
     def exit(self) -> None:
-        """Leave the process with the code of the signal, or let the scheduler's library put it into the queue again."""
+        """Leave the process with the code of the signal, or let the scheduler's library put it into the queue again.
+
+        Raises:
+            SystemExit: always, but for the next.
+            RuntimeError: if the job should be in the queue again and is not.
+        """
         assert self.signal is not None
         print("saved; the same command resumes from there", file=sys.stderr)
         requeue = self._before.get(_requeuing())
         self._restore()
-        if callable(requeue) and not _is_being_ended():
-            os.kill(os.getpid(), _requeuing())
+        if callable(requeue):
+            with _deaf():
+                if not _is_being_ended():
+                    _put_into_queue(requeue)
         raise SystemExit(128 + self.signal)
 
     def _ask(self, number: int, frame: FrameType | None) -> None:
@@ -73,14 +83,56 @@ class Interrupt:
                 signal.signal(number, before)
 
 
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """Ignore signals to stop, also in the processes that are started: SLURM sends them to all processes of a job."""
+    before = {}
+    for name in STOPPING:
+        number = getattr(signal, name, 0)
+        if number:
+            before[number] = signal.signal(number, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            if handler is not None:  # it was not set by Python
+                signal.signal(number, handler)
+
+
+def _put_into_queue(requeue: Callable[[int, FrameType | None], object]) -> None:
+    """Call submitit's handler, which leaves the process.
+
+    Raises:
+        RuntimeError: if that failed and SLURM does not have the job in its queue.
+    """
+    try:
+        requeue(_requeuing(), None)
+    except (OSError, subprocess.SubprocessError) as error:
+        if not _is_in_queue():
+            fix = "the same command resumes the run"
+            said = f"SLURM did not put job {_job()} into the queue again, as scontrol requeue failed: {fix}"
+            raise RuntimeError(said) from error
+
+
 def _is_being_ended() -> bool:
     """Return whether SLURM already ends this process's job: for good, as by ``scancel``, which a requeue would undo."""
+    shown = _shown_job()
+    return "JobState=COMPLETING" in shown or "JobState=CANCELLED" in shown
+
+
+def _is_in_queue() -> bool:
+    """Return whether SLURM has the job in its queue: it counts a restart at once, while it ends this one."""
+    restarts = re.search(r"Restarts=(\d+)", _shown_job())
+    return restarts is not None and int(restarts[1]) > int(os.environ.get("SLURM_RESTART_COUNT") or 0)
+
+
+def _shown_job() -> str:
+    """Return what SLURM tells of this process's job; nothing where it does not answer."""
     command = ["scontrol", "show", "job", _job()]
     try:
-        shown = subprocess.run(command, capture_output=True, text=True, timeout=10).stdout
+        return subprocess.run(command, capture_output=True, text=True, timeout=10).stdout
     except (OSError, subprocess.TimeoutExpired):
-        return False
-    return "JobState=COMPLETING" in shown or "JobState=CANCELLED" in shown
+        return ""
 
 
 def _job() -> str:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 from contextlib import contextmanager
 
@@ -128,6 +130,58 @@ def test_in_a_thread_signals_act_as_before():
 
     assert asked == [False]
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def of_submitit(number, frame):
+    """What submitit does at SIGUSR2."""
+    subprocess.check_call(["scontrol", "requeue", "7"])
+    sys.exit(-1)
+
+
+SCONTROL = """#!/bin/sh
+[ $1 = show ] && exec cat {folder}/job
+kill -TERM $$ $PPID; kill -USR2 $PPID  # as SLURM: to all processes of the job
+{requeue}
+"""
+
+
+@pytest.mark.parametrize(
+    ("requeue", "code"),
+    [
+        ("sleep 0.05; echo Restarts=2 >>FOLDER/requeued", 255),
+        ("echo JobState=COMPLETING Restarts=2 >FOLDER/job; kill -KILL $$", 143),  # killed once SLURM had heard it
+        ("kill -KILL $$", None),
+        ("exit 1", None),
+    ],
+)
+def test_a_second_signal_does_not_end_the_requeue_and_a_job_says_where_it_is_not_in_the_queue(
+    tmp_path, monkeypatch, requeue, code
+):
+    (tmp_path / "job").write_text("JobId=7 JobState=RUNNING Restarts=1")
+    script = SCONTROL.format(folder=tmp_path, requeue=requeue.replace("FOLDER", str(tmp_path)))
+    (tmp_path / "scontrol").write_text(script)
+    (tmp_path / "scontrol").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setenv("SLURM_JOB_ID", "7")
+    monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
+    bypassed = []
+
+    with (
+        handled(signal.SIGUSR2, of_submitit),
+        handled(signal.SIGTERM, lambda *_: bypassed.append(1)),
+        pytest.raises((SystemExit, RuntimeError)) as end,
+        Interrupt() as interrupt,
+    ):
+        send(signal.SIGTERM)
+        interrupt.exit()
+
+    if code is None:
+        said = "SLURM did not put job 7 into the queue again, as scontrol requeue failed: the same command resumes the"
+        assert isinstance(end.value, RuntimeError) and said in str(end.value)
+    else:
+        assert isinstance(end.value, SystemExit) and end.value.code % 256 == code
+    assert (tmp_path / "requeued").exists() == (code == 255)
+    assert bypassed == [] and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
 @pytest.mark.parametrize(("states", "is_requeued"), [({"7_1": "RUNNING"}, True), ({"7_1": "COMPLETING"}, False)])
