@@ -90,6 +90,10 @@ BOMBS = {
     ),
     "a text that is doubled again and again": (of_pickle(DOUBLED), "_codecs encode"),
     "a dictionary that is copied": (of_pickle(b"\x80\x02" + LIST + b"]\x85R."), "collections OrderedDict"),
+    "a dictionary that is copied by its name from the memo": (
+        of_pickle(b"\x80\x02" + LIST + b"q\x01)Rh\x01]\x85R\x86."),
+        "collections OrderedDict",
+    ),
     "two lists of records": (saved(1) + saved(2), "begin at its start and are listed at its end"),
     "something behind the records": (saved(1) + bytes(4), "more than tensors and plain values|listed at its end"),
     "the old form, which says its sizes itself": (

@@ -250,6 +250,37 @@ def test_only_trials_within_a_batch_are_learned_from():
     assert agent.learn(played(agent, steps=2)) == {}
 
 
+def test_the_adaptation_reads_the_first_episodes_of_a_trial_and_the_outer_loss_those_that_follow():
+    agent = made("maml")
+    batch = played(agent, steps=40)
+    number = batch["next", "trial"].squeeze(-1).tolist()
+    done = batch["next", "done"].squeeze(-1).tolist()
+    seen = batch["observation"].flatten(2).tolist()
+    expected = []
+    for row, numbers in enumerate(number):
+        steps: dict[bool, list] = {}
+        for t, episode in enumerate(numbers):
+            if episode == 1 and (t == 0 or numbers[t - 1] != 1):
+                steps = {True: [], False: []}
+            if steps:
+                steps[episode <= 2].append([*seen[row][t], float(batch["action"][row, t])])
+            if steps and episode == 4 and done[row][t]:
+                expected.append(steps)
+                steps = {}
+
+    trials = agent.trials(batch)
+
+    assert len(trials["action"]) == len(expected) > 5
+    for is_before in (True, False):
+        names = ("observation", "action", "weight")
+        seen_there, action, weight = (trials[("before", name) if is_before else name] for name in names)
+        found = torch.cat([seen_there.flatten(2), action.unsqueeze(-1)], dim=-1)
+        for trial, steps in enumerate(expected):
+            count = len(steps[is_before])
+            assert found[trial, :count].tolist() == steps[is_before]
+            assert (weight[trial] > 0).tolist() == [place < count for place in range(found.shape[1])]
+
+
 # The outer loop
 
 

@@ -22,6 +22,8 @@ DATA = Path(__file__).resolve().parents[1] / "data"
 TINY = ["agent.num_envs=8", "agent.num_steps=4", "agent.hidden_size=4"]
 REPLAY = ["agent.num_updates=1", "agent.batch_size=4", "agent.buffer_size=64", "agent.target_update_interval=2"]
 MINIBATCHES = ["agent.num_minibatches=2", "agent.num_epochs=1"]
+ADAPTS = ["agent.adapt_episodes=1", "agent.num_steps=16"]
+TRIALS = ["agent.trial_episodes=2", "agent.num_trials=2", "agent.context_size=4", *REPLAY[:3]]
 GENERATIONS = ["agent.num_batches=1", "agent.num_trials=1", "agent.num_updates=1", "agent.insert_prob=0.5"]
 METHODS = {
     "clear": ["method.buffer_size=48"],
@@ -29,7 +31,7 @@ METHODS = {
     **{name: ["method.num_samples=4"] for name in ("ewc", "ewc_published", "mas", "mask_amsc")},
 }
 FRAMES = (32, 64)
-"""Of the blocks: one batch and two, so that penalties of what was learned before act."""
+"""Of the blocks: one batch and two, so that penalties of what was learned before act; four times as many with trials."""
 
 
 def all_digests() -> dict[str, Any]:
@@ -45,7 +47,7 @@ def all_digests() -> dict[str, Any]:
     digests = {}
     for agent, make_agent in made["agent"].items():
         for method, make_method in made["method"].items():
-            digests[f"{agent} {method}"] = _digest(make_agent, make_method)
+            digests[f"{agent} {method}"] = _digest(_curriculum(make_agent), make_agent, make_method)
     return {"numbers": NUMBERS, "torch": versions()["torch"], "digests": digests}
 
 
@@ -70,20 +72,33 @@ def _builders(group: str) -> dict[str, Any]:
                     *REPLAY * ("target_update_interval" in cfg.agent),
                     *MINIBATCHES * ("num_minibatches" in cfg.agent),
                     *GENERATIONS * ("insert_prob" in cfg.agent),
+                    *ADAPTS * ("adapt_episodes" in cfg.agent),
+                    *TRIALS * ("context_size" in cfg.agent),
                 ]
             made[path.stem] = config.target(hydra.compose("config", overrides=[f"{group}={path.stem}", *small]), group)
     return made
 
 
-def _digest(make_agent: Any, make_method: Any) -> str:
-    """Return the digest of a run's weights and measurements, or why the agent cannot learn with the method."""
+def _curriculum(make_agent: Any) -> Any:
+    """Return two blocks that an agent can learn: of a task each, or of both for one that adapts within trials."""
     from helpers.scripted import ONE, TWO, of
 
-    from ctgraph_rl import Block, Evaluation, RunLog, learn_curriculum
+    from ctgraph_rl import Block, Evaluation
+
+    if {"adapt_episodes", "context_size"} & make_agent.keywords.keys():
+        blocks = [Block((ONE, TWO), 4 * frames) for frames in FRAMES]
+        evaluation = Evaluation(2, greedy=False, before=False, adapt_episodes=1)
+    else:
+        blocks = [Block(task, frames) for task, frames in zip((ONE, TWO), FRAMES, strict=True)]
+        evaluation = Evaluation(2, greedy=False, before=False)
+    return of(*blocks, evaluation=evaluation, task_id="one_hot")
+
+
+def _digest(curriculum: Any, make_agent: Any, make_method: Any) -> str:
+    """Return the digest of a run's weights and measurements, or why the agent cannot learn with the method."""
+    from ctgraph_rl import RunLog, learn_curriculum
     from ctgraph_rl.runs.train import new_agent, with_method
 
-    blocks = [Block(task, frames) for task, frames in zip((ONE, TWO), FRAMES, strict=True)]
-    curriculum = of(*blocks, evaluation=Evaluation(2, greedy=False, before=False), task_id="one_hot")
     try:
         curriculum = make_method().prepare(curriculum)
         agent = new_agent(curriculum, with_method(make_agent, make_method, curriculum), 0)

@@ -38,5 +38,9 @@ def test_tiny_portable_runs_of_every_agent_with_every_method_have_the_bits_of_th
     assert not changed, f"weights or measurements changed of {', '.join(changed)}: {HOW}"
 
 
-def test_the_file_of_a_numbers_version_names_it():
-    assert json.loads(FILE.read_text(encoding="utf-8"))["numbers"] == NUMBERS
+def test_the_file_of_a_numbers_version_names_it_and_every_agent_learns_there():
+    stored = json.loads(FILE.read_text(encoding="utf-8"))
+
+    assert stored["numbers"] == NUMBERS
+    agents = [path.stem for path in (CHECKOUT / "conf" / "agent").glob("*.yaml")]
+    assert agents and not [name for name in agents if len(stored["digests"][f"{name} finetune"]) != 16]

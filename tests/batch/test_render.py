@@ -1,9 +1,10 @@
 """Pictures: what they show, and that they show nothing else."""
 
+import numpy as np
 import pytest
 import torch
 
-from ctgraph_rl.batch.render import STATE_COLOURS, render
+from ctgraph_rl.batch.render import SCALE, STATE_COLOURS, Mark, _discs, render
 from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.tasks.images import OneHot, PaperImages
 from ctgraph_rl.tasks.observations import Observations
@@ -155,6 +156,15 @@ def test_the_colours_of_all_state_types_are_in_a_tree_and_differ():
     assert len(set(STATE_COLOURS.values())) == len(StateType)
     assert all(area >= 20 for area in areas.values())
     assert areas[StateType.END] > areas[StateType.DECISION] > areas[StateType.HOME]
+
+
+def test_the_discs_of_states_are_filled():
+    canvas = np.zeros((64, 64), dtype=np.uint8)
+
+    _discs(canvas, [Mark(8.0, 8.0, 6.0)], 3)
+
+    inside = np.hypot(*(np.indices(canvas.shape) - 8 * SCALE)) <= 6 * SCALE
+    assert np.array_equal(canvas == 3, inside)
 
 
 def test_the_fail_mark_is_outlined_on_failure_and_only_then():
