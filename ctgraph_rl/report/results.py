@@ -164,7 +164,9 @@ def comparisons(runs: Sequence[Run], metric: str) -> dict[tuple[str, str, str], 
     choices: dict[str, None] = {}
     for run in runs:
         choices |= dict.fromkeys(run.metrics)
-    require((metric in choices, _no_measure([metric], choices)))
+    exact = metric in metrics.METRICS and metrics.METRICS[metric].is_exact
+    same = f"{metric} follows from the curriculum, so that agents do not differ in it; compare another metric"
+    require((metric in choices, _no_measure([metric], choices)), (not exact, same))
     found = {}
     bounds = bounds_by_curriculum(runs)
     for (first, one), (second, other) in combinations(grouped(runs).items(), 2):
@@ -410,9 +412,11 @@ def _sentence(curriculum: str, first: str, second: str, found: Comparison, diffe
         sentence += f"; sign-flip p = {found.p_value:.3g}, Holm {found.holm:.3g}"
         if found.holm is None or found.holm > 1 - statistics.LEVEL:
             sentence += f": not distinguishable with {found.difference.n} seeds"
-    if difference is None or not found.std:
+        if found.needed is not None:
+            sentence += f"; {found.needed:,} would find such a difference with a chance of 80 %"
+    if difference is None or found.std is None:
         return sentence
-    seeds = statistics.seeds_needed(difference, found.std, paired=True)
+    seeds = statistics.pairs_needed(difference, found.std)
     return f"{sentence}; {seeds} seeds find a difference of {difference:g} with a chance of 80 %"
 
 

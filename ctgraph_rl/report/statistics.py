@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
 from statistics import fmean, median
@@ -25,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from ctgraph_rl.checks import fraction, is_int, positive, require, takes_numbers
+from ctgraph_rl.checks import at_least_one, fraction, is_int, not_negative, positive, require, takes_numbers
 from ctgraph_rl.report.intervals import UNBOUNDED, Bounds, gaffke, median_ranks, scipy, student, within_bounds
 
 LEVEL = 0.95
@@ -117,6 +118,8 @@ class Comparison:
         ties: pairs without a difference.
         losses: pairs in which the second is better.
         holm: the p-value corrected for all comparisons that were made; None where that is not known.
+        needed: pairs with which a difference such as this one is found, see `pairs_needed`; None where it was found,
+            where there is none, and where the number of comparisons is not known.
     """
 
     difference: Estimate
@@ -126,6 +129,7 @@ class Comparison:
     ties: int
     losses: int
     holm: float | None = None
+    needed: int | None = None
 
 
 @takes_numbers
@@ -371,9 +375,42 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
 
 
 def corrected(found: Mapping[Any, Comparison]) -> dict[Any, Comparison]:
-    """Return comparisons with their p-values corrected for the number of all."""
+    """Return comparisons with their p-values corrected for the number of all, and the pairs that they need."""
     p_values = holm([each.p_value for each in found.values()])
-    return {pair: replace(each, holm=p) for (pair, each), p in zip(found.items(), p_values, strict=True)}
+    count = sum(p is not None for p in p_values)
+    complete = {}
+    for (pair, each), p in zip(found.items(), p_values, strict=True):
+        needed = None
+        seen = each.difference.value
+        if seen and each.std is not None and p is not None and p > 1 - LEVEL:
+            with suppress(ValueError):  # more than `MOST_SEEDS`
+                needed = pairs_needed(seen, each.std, count)
+        complete[pair] = replace(each, holm=p, needed=needed)
+    return complete
+
+
+@takes_numbers
+def pairs_needed(difference: float, std: float, comparisons: int = 1, level: float = LEVEL) -> int:
+    """Return with how many pairs `compare` finds a difference with a chance of 80 %.
+
+    They are those of `seeds_needed`, and so many that the test can find anything: its smallest p-value is 2 / 2^n, 0.03
+    with six pairs. Both are corrected for the number of comparisons (Bonferroni).
+
+    Args:
+        difference: true difference of means, other than 0.
+        std: standard deviation of the differences of pairs, >= 0.
+        comparisons: how many are made.
+        level: 1 - level is the chance to find a difference that is not there in any of them.
+
+    Raises:
+        ValueError: for values out of range, and if `MOST_SEEDS` are not enough.
+    """
+    require(*at_least_one(comparisons=comparisons), *not_negative(std=std), *fraction(level=level))
+    chance = (1 - level) / comparisons
+    fewest = 2
+    while 2 / 2**fewest > chance:
+        fewest += 1
+    return max(fewest, seeds_needed(abs(difference), std, paired=True, level=1 - chance)) if std else fewest
 
 
 @takes_numbers

@@ -307,6 +307,8 @@ def test_seeds_together_learn_as_runs_alone_do_and_the_page_says_what_would_have
     assert {(len(alone), len(together)) for _, alone, together in found.values()} == {(30, 30)}
     assert sizes == {("alone", "1"), ("together", "30")}
     assert f"the lowest p of twelve paired tests is {min(each.p_value for each, *_ in found.values()):.2f}" in TOGETHER
+    less = [found[name, "final_return"][0].difference.shown for name in ("ppo", "ppo_count", "ppo_published")]
+    assert "are {} for PPO, {} with counts and {} for `ppo_published`.".format(*less) in TOGETHER
     equal = {agent: {each.ties for (name, _), (each, *_) in found.items() if name == agent} for agent, _ in found}
     assert equal["a2c"] | equal["dqn"] | equal["reinforce"] == {29, 30}
     least = {key: as_alone.detectable(each, 30) for key, (each, *_) in found.items()}

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from helpers.paths import CHECKOUT
 
 from ctgraph_rl.report import statistics
+from ctgraph_rl.report.intervals import Bounds
+from ctgraph_rl.tasks.kinds.gym_task import GymTask
 
 pytest.importorskip("scipy")
 PAGE = CHECKOUT / "docs" / "explanation" / "statistics.md"
@@ -30,10 +33,10 @@ def covered(cell: str) -> float:
 
 def test_the_page_is_its_template_with_tables(coverage):
     template = (CHECKOUT / "docs" / "results" / "templates" / "statistics.md").read_text(encoding="utf-8")
-    written = template.replace("$draws", f"{coverage.DRAWS:,}")
+    written = template.replace("$draws", f"{coverage.DRAWS:,}").replace("$noisy_draws", f"{coverage.NOISY_DRAWS:,}")
 
     blocks = PAGE.read_text(encoding="utf-8").split("\n\n")
-    tables = {"| returns | interval": "$of_means", "| number |  |": "$of_others"}
+    tables = {"| returns | interval": "$of_means", "| seeds | noise": "$of_noise", "| number |  |": "$of_others"}
     named = [next((name for head, name in tables.items() if block.startswith(head)), block) for block in blocks]
     assert "\n\n".join(named) == written
 
@@ -53,6 +56,49 @@ def test_two_outcomes_are_covered_as_exact_sums_say(coverage, rule):
 )
 def test_simulated_cells_are_computed_again(coverage, rule, shape, n):
     assert cells(shape, rule)[coverage.SEEDS.index(n)] == coverage.cell(rule, shape, n)
+
+
+@pytest.mark.parametrize(
+    ("kind", "noise", "n"),
+    [
+        ("equal, mean 1", 0.01, 3),
+        *(pytest.param("equal, mean 0.98", noise, 5, marks=pytest.mark.slow) for noise in (0.1, 2.0)),
+        *(pytest.param("solve at 0.5", 0.01, n, marks=pytest.mark.slow) for n in (20, 50)),
+        pytest.param("solve at 0.98", 0.5, 50, marks=pytest.mark.slow),
+    ],
+)
+def test_cells_of_noise_are_computed_again(coverage, kind, noise, n):
+    assert cells(kind, f"{noise:g}")[coverage.MORE_SEEDS.index(n)] == coverage.noisy_cell(kind, noise, n)
+
+
+def test_intervals_cover_noisy_returns_from_five_seeds_on(coverage):
+    shares = [
+        covered(cell) for kind in coverage.KINDS for noise in coverage.NOISES for cell in cells(kind, f"{noise:g}")
+    ]
+
+    assert len(shares) == 6 * 4 * 5 and (min(coverage.NOISES), max(coverage.NOISES)) == (0.01, 2)
+    assert min(shares) >= 94
+
+
+def test_bounds_of_a_mean_do_not_cover_noisy_returns_where_it_is_at_one(coverage):
+    samples, centre = coverage.noisy_returns("equal, mean 1", 0.01, n=20, draws=50)
+
+    assert not coverage.are_covered(np.clip(samples, 0, 1), centre, Bounds(0.0, 1.0)).any()
+    assert coverage.are_covered(samples, centre, Bounds(0.0, 1.0).widened(0.01)).all()
+
+
+@pytest.mark.parametrize("noise", [0.01, 2.0])
+@pytest.mark.parametrize("kind", ["equal, mean 0.5", "equal, mean 1", "solve at 0.9"])
+def test_what_is_counted_is_whether_the_intervals_of_the_package_hold_the_mean(coverage, kind, noise):
+    samples, _ = coverage.noisy_returns(kind, noise, n=5, draws=12)
+    samples[0, 0] = 20.0  # outside of all bounds, so that Student's interval counts
+    bounds = Bounds(0.0, 1.0).widened(noise)
+    found = [statistics.mean(sample, bounds=bounds) for sample in samples.tolist()]
+
+    for place, end in ((0, 1e-6), (1, -1e-6)):
+        for centre in [(each.low, each.high)[place] + shift for each in found[:4] for shift in (end, -end)]:
+            expected = [each.low <= centre <= each.high for each in found]
+            assert coverage.are_covered(samples, centre, bounds).tolist() == expected
 
 
 def test_times_are_computed_again(coverage):
@@ -106,3 +152,12 @@ def test_what_the_text_says_of_five_seeds_is_so():
     assert f"{0.9**5:.0%}" == "59%" and "in 59 % of cases" in text
     assert str(statistics.mean([0.0] * 5, bounds=(-1, 1))).startswith("0.00 [-0.52, 0.52]") and "[-0.52, 0.52]" in text
     assert statistics.compare([1.0] * 5, [0.0] * 5).p_value == 2 / 2**5
+    assert statistics.pairs_needed(1.0, 0.0) == 6 and "Six can reach 0.03" in text
+    assert statistics.pairs_needed(1.0, 0.0, comparisons=10) == 9 and "Holm's correction need nine" in text
+
+
+def test_what_the_text_says_of_the_slippery_lake_is_so():
+    lake = GymTask("FrozenLake-v1")
+
+    assert f"{lake.optimal_value(1.0):.2f}" == "0.74" and "an optimum of 0.74" in PAGE.read_text()
+    assert lake.return_bounds == (0, 1)

@@ -211,6 +211,15 @@ def test_an_unknown_metric_lists_those_that_there_are(tmp_path):
         comparisons(all_runs([tmp_path]), "accuracy")
 
 
+def test_agents_are_not_compared_in_what_follows_from_the_curriculum(tmp_path):
+    run = make_run(tmp_path, 0)
+    found = json.loads((run / "metrics.json").read_text())
+    (run / "metrics.json").write_text(json.dumps(found | {"optimal_performance": found["average_performance"]}))
+
+    with pytest.raises(ValueError, match=r"optimal_performance follows from the curriculum, .* compare another metric"):
+        comparisons(all_runs([tmp_path]), "optimal_performance")
+
+
 def test_one_run_twice_is_left_out_once_and_one_folder_twice_is_no_problem(tmp_path):
     first = make_run(tmp_path, 0)
     assert len(all_runs([tmp_path, tmp_path])) == 1
@@ -250,7 +259,8 @@ def test_the_table_is_printed_and_written(tmp_path, monkeypatch, capsys):
     assert "    average performance   0.81 [0.02, 1.61]    n = 2\n" in shown
     assert "mean [95 % CI], solved seeds and median times [exact 95 % CI]" in shown
     test = "sign-flip p = 0.5, Holm 0.5: not distinguishable with 2 seeds"
-    sentence = f"better in 2, equal in 0, worse in 0; {test}; 4 seeds find a difference of 0.25"
+    seen = "6 would find such a difference with a chance of 80 %"
+    sentence = f"better in 2, equal in 0, worse in 0; {test}; {seen}; 6 seeds find a difference of 0.25"
     assert sentence in " ".join(shown.split())
     rows = list(csv.DictReader((tmp_path / "table.csv").open(newline="")))
     assert tuple(rows[0]) == results.HEADER

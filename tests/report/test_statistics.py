@@ -21,6 +21,7 @@ from ctgraph_rl.report.statistics import (
     mean,
     mean_and_std,
     median_time,
+    pairs_needed,
     seeds_needed,
     solved_rate,
 )
@@ -348,6 +349,44 @@ def test_seeds_needed_are_those_of_published_power_tables(effect, paired, n):
     assert seeds_needed(effect * 0.3, 0.3, paired) == n
 
 
+def test_no_five_pairs_are_enough_and_six_are_where_the_test_is_the_limit():
+    assert [compare([1.0] * n, [0.0] * n).p_value <= 0.05 for n in (5, 6)] == [False, True]
+    assert [pairs_needed(-1.0, 0.0, comparisons) for comparisons in (1, 2, 10)] == [6, 7, 9]
+    assert pairs_needed(100.0, 1.0) == 6
+    assert pairs_needed(-0.5, 1.0) == seeds_needed(0.5, 1.0, paired=True) == 34
+    assert pairs_needed(0.5, 1.0, 10) == seeds_needed(0.5, 1.0, paired=True, level=0.995) == 58
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ratio", [1.0, 0.8])
+def test_so_many_pairs_find_the_difference_in_four_of_five_cases(ratio):
+    rng = np.random.default_rng(0)
+    n = pairs_needed(ratio, 1.0)
+
+    found = [compare(rng.normal(ratio, 1.0, n).tolist(), [0.0] * n).p_value <= 0.05 for _ in range(400)]
+
+    assert 0.74 <= np.mean(found) <= 0.88  # 0.8 and three standard errors of 400 cases
+
+
+def test_a_comparison_that_finds_nothing_says_with_how_many_pairs_it_would():
+    pairs = {
+        "small": compare([0.2, 0.0, 0.3, 0.1], [0.1] * 4),
+        "equal": compare([1.0] * 4, [1.0] * 4),
+        "found": compare([1.0 + place / 100 for place in range(12)], [0.0] * 12),
+        "none": compare([None] * 4, [0.0] * 4),
+    }
+
+    complete = statistics.corrected(pairs)
+
+    expected = pairs_needed(0.05, pairs["small"].std, comparisons=3)
+    assert {name: each.needed for name, each in complete.items()} == {
+        "small": expected,
+        "equal": None,
+        "found": None,
+        "none": None,
+    }
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -358,6 +397,8 @@ def test_seeds_needed_are_those_of_published_power_tables(effect, paired, n):
         (lambda: interquartile_mean([]), "needs the values of at least one task"),
         (lambda: interquartile_mean([[1.0]], resamples=1), "resamples must be an integer >= 100, got 1"),
         (lambda: seeds_needed(0.0, 1.0), "difference must be a number > 0, got 0.0"),
+        (lambda: pairs_needed(0.1, 1.0, comparisons=0), "comparisons must be an integer >= 1, got 0"),
+        (lambda: pairs_needed(0.0, 1.0), "difference must be a number > 0, got 0.0"),
         (lambda: seeds_needed(1e-9, 1.0), "1048576 seeds do not find a difference of 1e-09"),
     ],
 )

@@ -103,6 +103,8 @@ def verdicts(table: BoardTable) -> list[tuple[str, str, str]]:
     shown = []
     for (one, other), found in table.pairs.items():
         unclear = "" if is_significant(found) else ", not distinguishable"
+        if found.needed is not None:
+            unclear += f" ({found.needed:,} seeds would find it)"
         p_value = "-" if found.holm is None else f"{found.holm:.2g}{unclear}"
         shown.append((f"{one} - {other}", found.difference.shown, p_value))
     return shown

@@ -41,4 +41,4 @@ def two_groups(
             weights = rng.dirichlet(np.ones(len(group) + 1), RESAMPLES)
             means.append(weights @ np.vstack([group, np.full(group.shape[1], end)]))
         limits.append(float(np.quantile(measure(*means), tail, method="lower" if tail < 0.5 else "higher")))
-    return Estimate(value, low=limits[0], high=limits[1], n=n, n_undefined=0, method=method)
+    return Estimate(value, low=min(limits[0], value), high=max(limits[1], value), n=n, n_undefined=0, method=method)
