@@ -24,7 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
-from ctgraph_rl.log.files import LOG
+from ctgraph_rl.log.files import EX_TEMPFAIL, LOG
 from ctgraph_rl.log.refuse import quiet_where_nobody_reads
 from ctgraph_rl.packages import check_packages, conf_dir, first_imports, makes_page
 from ctgraph_rl.portable import Restart, become_portable, restart
@@ -189,7 +189,7 @@ def remove_empty(run_dir: Path) -> None:
 
 
 def main() -> None:
-    """Entry point: a user's error is one message and exit code 1; HYDRA_FULL_ERROR=1 shows where it came from."""
+    """Entry point: a user's error is one message and an exit code; HYDRA_FULL_ERROR=1 shows where it came from."""
     environment = dict(os.environ)
     arguments = sys.argv[1:]
     full_error = os.environ.setdefault("HYDRA_FULL_ERROR", "0") not in ("", "0")
@@ -215,7 +215,7 @@ def main() -> None:
         if full_error:
             raise cause from cause.__cause__
         print(f"error: {terminal_lines(message)}", file=sys.stderr)
-        sys.exit(1)
+        sys.exit(EX_TEMPFAIL if isinstance(cause, BlockingIOError) else 1)
     except KeyboardInterrupt:
         print("interrupted; the same command resumes from the last checkpoint", file=sys.stderr)
         sys.exit(130)

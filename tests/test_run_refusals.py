@@ -12,6 +12,7 @@ import pytest
 from helpers.sweeping import command_line, files_in
 
 from ctgraph_rl import Block, Curriculum
+from ctgraph_rl.log.files import locked
 from ctgraph_rl.run import run
 from ctgraph_rl.runs.config import composed, target
 from curricula.paper import ct_su_b1
@@ -141,6 +142,14 @@ def test_tasks_that_cannot_share_the_rows_leave_no_results(compose, tmp_path):
         run(cfg, tmp_path)
 
     assert files_in(tmp_path) == set()
+
+
+def test_a_directory_that_another_process_writes_exits_with_75(monkeypatch, capsys, tmp_path):
+    with locked(tmp_path):
+        code = command_line(monkeypatch, *SHORT, f"hydra.run.dir={tmp_path}")
+
+    assert code == 75
+    assert f"error: {tmp_path} is in use by process {os.getpid()} on " in capsys.readouterr().err
 
 
 def test_a_loss_that_is_not_finite_stops_the_run_and_names_block_and_loss(monkeypatch, capsys, tmp_path):

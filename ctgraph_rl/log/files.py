@@ -33,6 +33,9 @@ WITH_LOCKS = (
     "keep runs on a file system with locks (flock): set hydra.run.dir, with -m hydra.sweep.dir, and experts_dir"
 )
 
+EX_TEMPFAIL = 75
+"""Exit code of a command whose directory another process writes: a queue that restarts failed commands tries again."""
+
 SECONDS_BETWEEN_ATTEMPTS = 0.5
 """To get a lock that another writer has."""
 

@@ -108,7 +108,8 @@ def status_of(folder: Path, before: RunOutcome = NOTHING, error: str | None = No
     if user is not None:
         return Status(IN_USE, f"by {user}")
     if error is not None:
-        return Status(FAILED, error)
+        was_locked = error.startswith(BlockingIOError.__name__)
+        return Status(IN_USE if was_locked else FAILED, error)
     if now.failure not in (None, before.failure):
         return Status(FAILED, failure(folder))
     if now.results not in (None, before.results):

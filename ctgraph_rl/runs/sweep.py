@@ -23,12 +23,13 @@ from omegaconf import DictConfig, OmegaConf, read_write
 
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, require
 from ctgraph_rl.log.escape import terminal_text
-from ctgraph_rl.log.files import CHECKPOINTS, member_folder
+from ctgraph_rl.log.files import CHECKPOINTS, EX_TEMPFAIL, member_folder
 from ctgraph_rl.packages import check_packages, conf_dir
 from ctgraph_rl.portable import become_portable
 from ctgraph_rl.runs.config import check_overwrite, check_resolved, check_settings, explain, of_member, save_yaml
 from ctgraph_rl.runs.status import (
     DONE,
+    IN_USE,
     MISSING,
     NOTHING,
     SHOWN,
@@ -115,7 +116,7 @@ class Sweeper(Base):
 
         Raises:
             ValueError: if ``overwrite`` is not true, false or stale.
-            SystemExit: with code 1 if some are not done.
+            SystemExit: with code 75 if all that are not done are in use, and 1 if others are not done.
         """
         assert self.config is not None
         overwrite = self.config.overwrite
@@ -151,8 +152,9 @@ class Sweeper(Base):
                 print(f"note: {self._num_unknown} {unsaid}")
             statuses = dict(zip(shortened(list(cells.values())), found.values(), strict=True))
             print(report(statuses, len(batch) - len(cells), None if self.status else SHOWN))
-        if any(state != DONE for state, _ in found.values()):
-            sys.exit(1)
+        left_over = {state for state, _ in found.values()} - {DONE}
+        if left_over:
+            sys.exit(EX_TEMPFAIL if left_over == {IN_USE} else 1)
         if not self.status:
             Sweeper.done = list(cells)
 
