@@ -31,7 +31,7 @@ METHODS = {
     **{name: ["method.num_samples=4"] for name in ("ewc", "ewc_published", "mas", "mask_amsc")},
 }
 FRAMES = (32, 64)
-"""Of the blocks: one batch and two, so that penalties of what was learned before act; four times as many with trials."""
+"""Of the blocks: one batch and two, so that penalties of what was learned before act; with trials four times that."""
 
 
 def all_digests() -> dict[str, Any]:

@@ -82,7 +82,7 @@ def test_a_recorder_that_writes_keeps_all_others_out_until_it_ends_by_an_error_o
 
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
     for frames in TASKS.moments:
-        recorder.evaluate(lambda images: images.flatten(1).argmax(1) % 3, frames)
+        recorder.evaluate(lambda images: [0] * len(images), frames)
     recorder.close()
     recorder.close()
     assert not (tmp_path / LOCK).exists()
