@@ -183,7 +183,18 @@ def test_noise_widens_what_a_seed_can_have_by_four_standard_deviations_of_its_me
     assert bounds.of_training == (-2, 3)  # a mean of one episode
     assert bounds.of_metric("normalised_performance") == pytest.approx((-0.2, 1.2))
     assert bounds.of_metric("regret") == UNBOUNDED
+    assert bounds.of_metric("maintenance_of_evaluation") == pytest.approx((-140, 140))
     assert bounds.of_metric("remembering")[1] == 1
+
+
+def test_held_out_tasks_that_pay_more_widen_the_bounds_of_what_is_measured_on_them():
+    curriculum = curricula.load("ct8")
+    held_out = replace(curriculum.tasks[0], goal_reward=2.0)
+    evaluation = replace(curriculum.evaluation, held_out=(held_out,))
+
+    found = bounds_of_curriculum(replace(curriculum, evaluation=evaluation))
+    assert found.of_metric("held_out_adapted_return") == (0, 2)
+    assert found.of_task(curriculum.labels[0]) == (0, 1)
 
 
 def test_adaptation_measures_fewer_episodes_so_that_its_noise_is_larger():

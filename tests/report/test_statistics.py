@@ -163,6 +163,16 @@ def test_noise_puts_the_bounds_further_out_and_values_stay_as_they_are():
     assert clipped.high < 1 < found.high < 1.04
 
 
+@pytest.mark.parametrize(
+    ("values", "bounds"),
+    [([1 + 5e-7] * 3, (0, 1)), ([-5e-7] * 3, (0, 1)), ([-5e-7, -4e-7, -5e-7], (0, math.inf)), ([5e-7] * 3, (-1, 0))],
+)
+def test_a_mean_beyond_its_bounds_by_rounding_is_an_end_of_its_interval(values, bounds):
+    found = mean(values, bounds=bounds)
+
+    assert found.value in (found.low, found.high)
+
+
 @pytest.mark.parametrize(("low", "high"), [(0.6, 0.9), (0.1, 0.4), (None, 0.9), (0.1, None), (math.nan, 0.9)])
 def test_an_estimate_outside_of_its_interval_cannot_be_built(low, high):
     with pytest.raises(ValueError, match=r"an interval must have two ends around its value, got 0.5"):
