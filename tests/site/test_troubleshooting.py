@@ -1,24 +1,31 @@
-"""The page about errors quotes messages that are raised, word for word."""
+"""The page on troubleshooting quotes messages that are raised, word for word."""
 
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from helpers.paths import CHECKOUT
 from helpers.sweeping import command_line
 
 from ctgraph_rl import CTGraph, CTGraphEnv, Observations, PaperImages, Task
+from ctgraph_rl.core import kernel
 from ctgraph_rl.core.device import checked_device
+from ctgraph_rl.report import intervals
 from ctgraph_rl.tasks.configurations import ct_fo_b1, ct_su_b1
+from ctgraph_rl.visualize import style
 
-TEXT = (CHECKOUT / "docs" / "reference" / "errors.md").read_text(encoding="utf-8")
+TEXT = (CHECKOUT / "docs" / "how-to" / "troubleshooting.md").read_text(encoding="utf-8")
 QUOTED = re.findall(r"^\| `(.+?)` \|", TEXT, re.MULTILINE)
 OF_RUNS = (
     "... holds a run of other code",
     "... is nan in",
+    "... is in use by process",
+    "... is not finished: it needs",
     "seeds ... are for tuning",
     "curriculum ... has fingerprint",
     "no agent can be built",
@@ -38,6 +45,9 @@ RAISED: list[Callable[[], object]] = [
     lambda: replace(ct_su_b1(), step_reward=-0.01).memoryless_ceiling(),
     lambda: CTGraphEnv([ct_su_b1()]).set_tasks([ct_fo_b1()]),
     lambda: checked_device("cuda"),
+    lambda: kernel._key(Path(kernel.__file__), ["no-compiler"]),
+    lambda: intervals.scipy("stats"),
+    lambda: style.new_figure(1, 1),
 ]
 
 TYPED = (
@@ -58,14 +68,16 @@ def matches(quoted: str, message: str) -> bool:
 
 def test_every_message_that_the_page_quotes_is_raised(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
+    for package in ("scipy", "matplotlib"):
+        monkeypatch.setitem(sys.modules, package, None)
     for words in TYPED:
         assert command_line(monkeypatch, *words.split()) == 1
     messages = [line.removeprefix("error: ") for line in capsys.readouterr().err.splitlines()]
     for raised in RAISED:
-        with pytest.raises(ValueError) as refusal:
+        with pytest.raises((ValueError, ModuleNotFoundError)) as refusal:
             raised()
         messages.append(str(refusal.value))
-    assert len(QUOTED) >= 11
+    assert len(QUOTED) >= 17
     assert len(messages) == len(TYPED) + len(RAISED)
     assert [
         quoted
