@@ -358,7 +358,7 @@ class RunLog:
         """
         points: dict[tuple[int, int], dict[int, float]] = {}
         for m in self._evaluations(during=True):
-            points.setdefault((m["block"], m["frames"]), {})[m["task"]] = m.get(name)
+            points.setdefault((m["block"], m["frames"]), {})[m["task"]] = m.get(name, math.nan)
         require((bool(points), "this log has no evaluation"))
         blocks, frames = zip(*points, strict=True)
         of_blocks = self._trained(trained)
