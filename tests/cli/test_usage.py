@@ -31,6 +31,14 @@ def call(monkeypatch, capsys):
     return call_
 
 
+@pytest.mark.parametrize("word", ["=4", "curriculum.depth", "="])
+def test_a_setting_to_choose_runs_by_has_a_name_and_a_value(call, word):
+    code, _, said = call("submit", "runs", "--to", "made", "--only", word)
+
+    assert code == 2
+    assert f"settings are written as in curriculum.depth=4, got {word!r}" in said
+
+
 @pytest.fixture
 def runs(monkeypatch) -> list[list[str]]:
     """The settings of the runs that are started, which then do nothing."""

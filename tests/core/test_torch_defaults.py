@@ -36,6 +36,7 @@ from ctgraph_rl import (
     make_agent,
     scores,
 )
+from ctgraph_rl.batch.gym_env import GymEnv
 from ctgraph_rl.gym import CTGraphGymEnv, CTGraphVectorEnv
 from ctgraph_rl.learn.collective import Member, learn_collective
 from ctgraph_rl.learn.stacked import learn_together
@@ -45,6 +46,7 @@ from ctgraph_rl.runs.job import run_job
 from ctgraph_rl.runs.load import load
 from ctgraph_rl.runs.train import new_agent, with_method
 from ctgraph_rl.sb3 import SB3VecEnv
+from ctgraph_rl.tasks.kinds.gym_task import GymTask
 from ctgraph_rl.tasks.protocol import Protocol
 
 FLOATS = "zeros ones empty full eye linspace logspace rand randn normal tensor as_tensor asarray"
@@ -202,6 +204,16 @@ SETTINGS = tuple(product(STATES, ("off", "auto")))
 def test_every_environment_shows_the_same(name, setting):
     state, kernel = setting
     assert_independent(state, lambda: stepped(TASKS[name], kernel))
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_rows_of_gymnasium_have_the_same_specs_and_data(state):
+    def specs_and_data() -> Any:
+        env = GymEnv([GymTask("FrozenLake-v1")] * 2, seed=3)
+        dtypes = {str(key): str(spec.dtype) for key, spec in env.output_spec.items(True, True)}
+        return dtypes, env.reset().to_dict()
+
+    assert_independent(state, specs_and_data)
 
 
 class Logits(nn.Module):

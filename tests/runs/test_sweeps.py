@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import os
 import signal
@@ -411,6 +412,19 @@ def test_progress_counts_cells_and_tells_the_time_left(tmp_path):
     line = progress.describe(done, failed, running, ended=5, seconds=600)
     assert line == "9/300 cells done  1 failed  0 running  0.5/min  9:40:00 left"
     assert progress.describe(9, 1, 0, ended=0, seconds=1).endswith("? left")
+
+
+@pytest.mark.parametrize(("seconds", "pause"), [(0.01, 1.0), (0.5, 10.0)])
+def test_directories_are_looked_at_every_second_or_for_a_twentieth_of_the_time(tmp_path, monkeypatch, seconds, pause):
+    progress = SweepProgress({tmp_path: RunOutcome()}, console=Console(file=io.StringIO()))
+    pauses: list[float] = []
+    clock = itertools.count(0, seconds)
+    monkeypatch.setattr("ctgraph_rl.runs.status.time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    monkeypatch.setattr(progress._stop, "wait", lambda pause: pauses.append(pause) or len(pauses) == 3)
+
+    progress._watch()
+
+    assert pauses == pytest.approx([1.0, pause, pause])
 
 
 def test_progress_on_a_terminal_ends_with_the_cells_that_were_done_last(tmp_path):

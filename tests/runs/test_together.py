@@ -104,6 +104,7 @@ def test_each_seed_leaves_the_files_of_a_run_alone_and_says_which_seeds_were_bes
     assert (first_line(one)["numbers"], first_line(other)["numbers"]) == (NUMBERS_TOGETHER, NUMBERS)
     assert load(one).agent.state_dict().keys() == load(other).agent.state_dict().keys()
     assert "seed=1" in (one / ".hydra" / "overrides.yaml").read_text()
+    assert "seeds:" not in (one / ".hydra" / "config.yaml").read_text()
     shown = compare(one, other).lines
     assert any("together" in line and "[0, 1, 2]" in line for line in shown), shown
 

@@ -20,7 +20,7 @@ from matplotlib.colors import to_rgb
 from ctgraph_rl.report.figures import heatmaps
 from ctgraph_rl.report.figures.heatmaps import draw_matrices
 from ctgraph_rl.report.figures.labels import draw_labels, label_strips
-from ctgraph_rl.report.figures.learning_curves import draw_mean, draw_tasks
+from ctgraph_rl.report.figures.learning_curves import draw_mean, draw_tasks, training_curves
 from ctgraph_rl.report.style import contrast, ink, style
 from ctgraph_rl.report.terminal import label_notes
 
@@ -44,6 +44,14 @@ def section(tmp_path):
 )
 def test_contrast_is_that_of_the_web_guidelines(one, other, ratio):
     assert contrast(one, other) == contrast(other, one) == pytest.approx(ratio, abs=1e-3)
+
+
+def test_without_returns_of_training_there_is_no_figure_of_them(section, tmp_path):
+    write_run(tmp_path / "untrained" / "0", intervals=0)
+    untrained = sections(find_runs([tmp_path / "untrained"])[0])[0]
+
+    assert training_curves(section) is not None
+    assert training_curves(untrained) is None
 
 
 @pytest.mark.parametrize("colours", ["viridis", "PuOr"])
