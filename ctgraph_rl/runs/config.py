@@ -238,8 +238,6 @@ def check_settings(cfg: DictConfig) -> None:
     require((isinstance(folder, str) and bool(folder), f"experts_dir must be the path of a folder, got {folder!r}"))
     for switch in ("experts", "report", "portable", "together"):
         require((isinstance(cfg[switch], bool), f"{switch} must be true or false, got {cfg[switch]!r}"))
-    seeds = "add -m and several seeds, such as seed=range(20), or together=false for one run"
-    require((in_sweep() or not cfg.together, f"together=true trains the seeds of a sweep as one batch: {seeds}"))
     require(
         check_overwrite(cfg.overwrite),
         *one_of(RESUME, resume=cfg.resume),
@@ -254,6 +252,8 @@ def check_values(cfg: DictConfig) -> None:
         ValueError: for one out of range.
     """
     check_settings(cfg)
+    seeds = "add -m and several seeds, such as seed=range(20), or together=false for one run"
+    require((in_sweep() or not cfg.together, f"together=true trains the seeds of a sweep as one batch: {seeds}"))
     cores = os.cpu_count() or 1
     threads_rule = f"num_threads must be in 1..{cores}, the cores of this machine, got {cfg.num_threads!r}"
     require((is_int(cfg.num_threads, 1, cores), threads_rule))
