@@ -9,6 +9,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import curricula
 from ctgraph_rl import (
@@ -263,3 +264,17 @@ def test_the_count_of_histories_is_that_of_the_images_drawn():
     assert count_histories(ct_su_b1(), False) == 4
     assert count_histories(ct_su_b1(), True) == 3 * 4
     assert count_histories(few_images(ct_co_b1(), 3), False) == 3**3 * 4
+
+
+@pytest.mark.parametrize("name", ["dqn", "qrdqn_lstm"])
+def test_exploration_has_its_share_of_every_action(small_agent, name):
+    task = ct_su_b1()
+    agent = small_agent(name, [task])
+    agent.exploration.eps.fill_(0.3)
+    data = {"observation": torch.zeros(2, *task.observation_shape, dtype=torch.uint8), "is_init": torch.ones(2, 1) > 0}
+    data |= dict(agent.initial_state(2).items())
+
+    with set_exploration_type(ExplorationType.RANDOM):
+        probs, _ = agent.policy.action_probs(data)
+
+    assert torch.allclose(probs.sort(dim=1).values, probs.new_tensor([0.1, 0.1, 0.8]))
