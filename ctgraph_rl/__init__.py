@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from ctgraph_rl.tasks.images import ReferenceOneHot as ReferenceOneHot
     from ctgraph_rl.tasks.images.measures import count_repeats as count_repeats
     from ctgraph_rl.tasks.images.measures import distances as distances
+    from ctgraph_rl.tasks.kinds.gym_task import GymTask as GymTask
+    from ctgraph_rl.tasks.kinds.task_like import TaskLike as TaskLike
     from ctgraph_rl.tasks.observations import Observations as Observations
     from ctgraph_rl.tasks.protocol import Block as Block
     from ctgraph_rl.tasks.protocol import Evaluation as Evaluation
@@ -67,6 +69,8 @@ _EXPORTS = {
     "tasks.curriculum": ("Curriculum",),
     "tasks.images": ("GroupedImages", "ImageFile", "OneHot", "PaperImages", "ReferenceImages", "ReferenceOneHot"),
     "tasks.images.measures": ("count_repeats", "distances"),
+    "tasks.kinds.gym_task": ("GymTask",),
+    "tasks.kinds.task_like": ("TaskLike",),
     "tasks.observations": ("Observations",),
     "tasks.protocol": ("Block", "Evaluation", "Protocol"),
     "tasks.task": ("Task",),

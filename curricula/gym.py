@@ -63,7 +63,7 @@ def frozen_lake_4maps(num_frames: int = 20_480) -> Curriculum:
     tasks = [
         GymTask(
             "FrozenLake-v1",
-            {"desc": rows, "is_slippery": slippery},
+            {"desc": list(rows), "is_slippery": slippery},
             label=f"{place}-{'slippery' if slippery else 'firm'}",
         )
         for place, rows in MAPS.items()

@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torch.nn.functional import one_hot
 from torchrl.data import Bounded, Categorical, Unbounded
 from torchrl.envs import EnvBase
 
 from ctgraph_rl.batch.assignment import checked_num_ids, one_hot_ids
 from ctgraph_rl.batch.rows import seed_rule
 from ctgraph_rl.batch.specs import done_spec, observation_spec, reward_spec
-from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule, require, require_all
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule, require, require_all, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import beside
-from ctgraph_rl.tasks.kinds.gym_task import GymTask, spaces_of
+from ctgraph_rl.tasks.kinds.gym_spaces import ActionForm, ObservationForm
+from ctgraph_rl.tasks.kinds.gym_task import GymTask, make_forms, registered
+from ctgraph_rl.tasks.kinds.task_like import close_env
+
+T = TypeVar("T")
 
 NUM_PROBED = 20
 """Steps by which it is seen whether an environment repeats."""
@@ -31,7 +34,8 @@ class GymEnv(EnvBase):
     """A batch of environments of Gymnasium, ``batch_size=[len(tasks)]``, stepped one after the other.
 
     ``next`` shows the last observation of an episode. An episode that has ended by itself is ``terminated``, one that
-    the time limit ended ``truncated``. The observation keys are those of `TaskLike.make_env`.
+    the time limit ended ``truncated``. The observation keys are those of `TaskLike.make_env`. `close` closes the
+    environments, as many as rows; that of a row is closed where the row gets another task.
 
     Args:
         tasks: one for each row.
@@ -42,7 +46,9 @@ class GymEnv(EnvBase):
         num_task_ids: length of ``task_id``; None: just enough.
 
     Raises:
-        ValueError: for tasks of different spaces, and an environment that does not repeat with its seed.
+        ValueError: for tasks of different spaces, an environment that does not repeat with its seed, and one that
+            returns what its spaces do not hold.
+        FloatingPointError: for an observation or a reward that is not finite; names environment, task and frame.
 
     Example:
         >>> env = GymEnv([GymTask("CartPole-v1")] * 2, seed=0)
@@ -52,6 +58,7 @@ class GymEnv(EnvBase):
 
     batch_locked = True
 
+    @takes_numbers
     def __init__(
         self,
         tasks: Iterable[GymTask],
@@ -65,7 +72,9 @@ class GymEnv(EnvBase):
         tasks = require_all(GymTask, "tasks", tasks)
         pool = tasks if task_pool is None else require_all(GymTask, "task_pool", task_pool)
         self.pool = tuple(dict.fromkeys((*pool, *tasks)))
-        require(seed_rule(seed), _same_spaces(self.pool), *map(_repeats_rule, self.pool))
+        require(
+            seed_rule(seed), _same_spaces(self.pool), *(_repeats_rule(task, registered(task)) for task in self.pool)
+        )
         self.num_task_ids = checked_num_ids(task_ids, num_task_ids)
         count = len(tasks)
         super().__init__(device=checked_device(device), batch_size=torch.Size([count]))
@@ -75,24 +84,38 @@ class GymEnv(EnvBase):
         self._next = tasks
         self._episode = np.full(count, -1, dtype=np.int64)
         self._actions: list[list[Any]] = [[] for _ in tasks]
-        self._rows = SyncVectorEnv(
-            [task.make for task in tasks],
-            autoreset_mode=AutoresetMode.DISABLED,  # so that the last observation shows, and we give each seed
-            observation_mode="different",
-            copy=False,
-        )
-        self._made = [{task: env} for task, env in zip(tasks, self._rows.envs, strict=True)]
+        self._forms = {task: make_forms(task) for task in self.pool}
+        self._num_frames = 0
+        self._envs: list[Any] = []
+        self.is_closed = False
+        try:
+            for task in tasks:
+                self._envs.append(task.make())
+        except BaseException:
+            self.close()
+            raise
         self._make_specs()
 
     def _make_specs(self) -> None:
         rows = self.batch_size
-        observed, acted = spaces_of(self.pool[0])
-        seen = _spec_of_observations(observed, (*rows, *self.pool[0].observation_shape))
+        observed, acted = self._forms[self.pool[0]]
+        seen = _spec_of_observations(observed, (*rows, *observed.shape))
         self.observation_spec = observation_spec(seen, rows, self.num_task_ids).to(self.device)
         self.action_spec = _spec_of_actions(acted, rows).to(self.device)
         self.reward_spec = reward_spec(rows).to(self.device)
         self.full_done_spec = done_spec(rows).to(self.device)
         self._data = {**self.observation_spec.zero(), **self.full_done_spec.zero()}
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Close the environments of all rows; one that fails is named and does not keep others open."""
+        super().close(raise_if_closed=raise_if_closed)
+        envs = self._envs
+        self._envs = []
+        for env in envs:
+            close_env(env)
+
+    def _check_open(self) -> None:
+        require((not self.is_closed, "the environments of this GymEnv are closed: make another one"))
 
     def set_tasks(self, tasks: Iterable[GymTask], at_episode_end: bool = False) -> None:
         """Give every row a task of the pool: before the next reset of all rows, or at the end of its episode.
@@ -111,18 +134,19 @@ class GymEnv(EnvBase):
             self._place(range(len(tasks)))
 
     def _place(self, rows: Iterable[int]) -> None:
-        """Give rows their next tasks, and put the environments of these in place; each is made once."""
+        """Give rows their next tasks, and put the environments of these in place."""
         tasks = list(self.tasks)
         for row in rows:
-            made = self._made[row]
             task = self._next[row]
-            if task not in made:
-                made[task] = task.make()
-            self._rows.envs[row] = made[task]
-            tasks[row] = task
+            if task != tasks[row]:
+                former = self._envs[row]
+                self._envs[row] = task.make()
+                tasks[row] = task
+                close_env(former)
         self.tasks = tuple(tasks)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
+        self._check_open()
         given = None if tensordict is None else tensordict.get("_reset", None)
         mask = np.ones(len(self.tasks), dtype=bool)
         if given is not None and (self._episode >= 0).all():
@@ -130,35 +154,64 @@ class GymEnv(EnvBase):
         rows = np.flatnonzero(mask).tolist()
         self._place(rows)
         self._episode[mask] += 1
-        seeds: list[int | None] = [None] * len(mask)
+        seen = self._zero_observations()
         for row in rows:
             self._actions[row] = []
-            seeds[row] = self._episode_seed(row)
-        observations, _ = self._rows.reset(seed=seeds, options={"reset_mask": mask})
+            seen[row] = self._begin(row)
         begun = torch.from_numpy(mask).to(self.device).unsqueeze(-1)
-        data = self._observed(observations)
+        data = self._observed(seen)
         for key, value in self._data.items():
             first = data[key] if key in data else torch.zeros_like(value)
             data[key] = torch.where(beside(begun, value), first, value)
         data["is_init"] = begun
         return self._shown(data)
 
+    def _begin(self, row: int) -> NDArray[Any]:
+        """Begin a row's present episode; return what it shows."""
+        observed, _ = self._forms[self.tasks[row]]
+        env = self._envs[row]
+        return self._read(row, lambda seed: observed.read_first(_reset(env, seed)), self._episode_seed(row))
+
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        action = tensordict["action"].cpu().numpy()
-        for played, taken in zip(self._actions, action, strict=True):
-            played.append(taken)
-        observations, reward, terminated, truncated, _ = self._rows.step(self._as_given(action))
-        rewards = self._column(reward, torch.float32)
-        data = self._observed(observations)
+        self._check_open()
+        actions = self._forms[self.pool[0]][1].read(tensordict["action"].detach().cpu().numpy())
+        seen = self._zero_observations()
+        rewards = []
+        terminated = []
+        truncated = []
+        for row, env in enumerate(self._envs):
+            observed, acted = self._forms[self.tasks[row]]
+            self._actions[row].append(actions[row])
+            taken = self._read(row, observed.read_step, env.step(acted.give(actions[row])))
+            seen[row] = taken.observation
+            rewards.append(taken.reward)
+            terminated.append(taken.terminated)
+            truncated.append(taken.truncated)
+        self._num_frames += len(self._envs)
+        reward = self._column(rewards, torch.float32)
+        data = self._observed(seen)
         data["terminated"] = self._column(terminated, torch.bool)
         data["truncated"] = self._column(truncated, torch.bool)
         data["done"] = data["terminated"] | data["truncated"]
         data["is_init"] = torch.zeros_like(data["done"])
         data["step_count"] = self._data["step_count"] + 1
-        data["episode_reward"] = self._data["episode_reward"] + rewards
-        return self._shown(data).set("reward", rewards)
+        data["episode_reward"] = self._data["episode_reward"] + reward
+        return self._shown(data).set("reward", reward)
 
-    def _column(self, values: np.ndarray, dtype: torch.dtype) -> Tensor:
+    def _read(self, row: int, read: Callable[[Any], T], returned: Any) -> T:
+        """Return what an environment returned, read; say in errors where it was."""
+        try:
+            return read(returned)
+        except (ValueError, FloatingPointError) as error:
+            step = len(self._actions[row])
+            place = f"frame {self._num_frames + row + 1}, step {step} of an episode with seed {self._episode_seed(row)}"
+            raise type(error)(f"{_name(self.tasks[row])}: {error} ({place})") from error
+
+    def _zero_observations(self) -> NDArray[Any]:
+        observed = self._forms[self.pool[0]][0]
+        return np.zeros((len(self.tasks), *observed.shape), dtype=observed.dtype)
+
+    def _column(self, values: Sequence[float], dtype: torch.dtype) -> Tensor:
         """Return a value of each row, [rows, 1]."""
         return torch.tensor(values, dtype=dtype, device=self.device).unsqueeze(-1)
 
@@ -166,35 +219,23 @@ class GymEnv(EnvBase):
         self._data = data
         return TensorDict(data, batch_size=self.batch_size, device=self.device).clone()
 
-    def _observed(self, observations: Any) -> dict[str, Tensor]:
+    def _observed(self, seen: NDArray[Any]) -> dict[str, Tensor]:
         """Return what rows show of their observations and tasks."""
-        shape = self.pool[0].observation_shape
-        space = spaces_of(self.pool[0])[0]
-        seen = torch.from_numpy(np.array(observations)).to(self.device)
-        if hasattr(space, "n"):
-            numbers = seen.long() - int(space.start)
-            seen = one_hot(numbers, shape[0]).to(torch.uint8)
-        elif space.dtype == np.uint8:
-            seen = seen.permute(0, 3, 1, 2) if seen.ndim == 4 else seen.view(-1, *shape)
-        else:
-            seen = seen.float()
-        data = {"observation": seen.contiguous()}
+        data = {"observation": torch.from_numpy(seen).to(self.device)}
         if self.num_task_ids:
             ids = torch.tensor([self._ids.get(task, -1) for task in self.tasks], device=self.device, dtype=torch.int64)
             data["task_id"] = one_hot_ids(ids, self.num_task_ids)
         return data
 
-    def _as_given(self, action: np.ndarray) -> np.ndarray:
-        """Return actions as Gymnasium counts them."""
-        if action.ndim > 1:
-            return action
-        _, space = spaces_of(self.pool[0])
-        return action + int(getattr(space, "start", 0))
-
     def _episode_seed(self, row: int) -> int:
         """Return the seed of a row's present episode, in [0, 2**31)."""
         sequence = np.random.SeedSequence((self.seed, row, int(self._episode[row])))
         return int(sequence.generate_state(1)[0] >> 1)
+
+    @takes_numbers
+    def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
+        """Begin the episodes of another seed with the next reset; see ``EnvBase``."""
+        return super().set_seed(seed, static_seed)
 
     def _set_seed(self, seed: int | None) -> None:
         """Begin the episodes of another seed with the next reset."""
@@ -207,6 +248,7 @@ class GymEnv(EnvBase):
         return {
             "tasks": self._numbers(self.tasks),
             "next_tasks": self._numbers(self._next),
+            "num_frames": self._num_frames,
             "episode": torch.from_numpy(self._episode.copy()),
             "actions": [torch.from_numpy(np.array(played)) for played in self._actions],
             "data": dict(self._data),
@@ -228,18 +270,19 @@ class GymEnv(EnvBase):
         self._next = self._numbered(state_dict["tasks"])
         self._place(rows)
         self._next = self._numbered(state_dict["next_tasks"])
+        self._num_frames = state_dict["num_frames"]
         self._episode = state_dict["episode"].numpy().copy()
         kept = all(task.repeats for task in self.tasks)
         self._actions = [list(played.numpy()) if kept else [] for played in state_dict["actions"]]
-        seeds: list[int | None] = [self._episode_seed(row) for row in rows]
-        begun, _ = self._rows.reset(seed=seeds, options={"reset_mask": np.ones(len(seeds), dtype=bool)})
-        found = np.array(begun)
+        seen = self._zero_observations()
         for row in rows:
+            observed, acted = self._forms[self.tasks[row]]
+            seen[row] = self._begin(row)
             for action in self._actions[row]:
-                [given] = self._as_given(np.asarray([action]))
-                found[row], *_ = self._rows.envs[row].step(given)
+                returned = self._envs[row].step(acted.give(action))
+                seen[row] = self._read(row, observed.read_step, returned).observation
         self._data = {key: value.to(self.device) for key, value in state_dict["data"].items()}
-        same = self._observed(found)["observation"].equal(self._data["observation"])
+        same = self._observed(seen)["observation"].equal(self._data["observation"])
         require(
             (same or not kept, f"{self.tasks[0].id} does not show what it showed before the run was stopped: {FIX}")
         )
@@ -248,22 +291,19 @@ class GymEnv(EnvBase):
 FIX = "make reset(seed=...) decide all of an episode, or give GymTask(repeats=False)"
 
 
-def _spec_of_observations(space: Any, shape: tuple[int, ...]) -> Any:
-    if hasattr(space, "n"):
-        return Bounded(0, 1, shape=shape, dtype=torch.uint8, device="cpu")
-    if space.dtype == np.uint8:
-        return Bounded(0, 255, shape=shape, dtype=torch.uint8, device="cpu")
+def _spec_of_observations(observed: ObservationForm, shape: tuple[int, ...]) -> Any:
+    if observed.dtype == np.uint8:
+        return Bounded(0, observed.largest, shape=shape, dtype=torch.uint8, device="cpu")
     return Unbounded(shape=shape, dtype=torch.float32, device="cpu")
 
 
-def _spec_of_actions(space: Any, rows: torch.Size) -> Any:
-    if hasattr(space, "n"):
-        return Categorical(int(space.n), shape=rows, dtype=torch.int64, device="cpu")
-    shape = (*rows, *space.shape)
-    ends = np.stack([space.low, space.high])
-    if not np.isfinite(ends).all():
+def _spec_of_actions(acted: ActionForm, rows: torch.Size) -> Any:
+    if acted.num_actions is not None:
+        return Categorical(acted.num_actions, shape=rows, dtype=torch.int64, device="cpu")
+    shape = (*rows, *acted.shape)
+    if not np.isfinite(acted.ends).all():
         return Unbounded(shape=shape, dtype=torch.float32, device="cpu")
-    low, high = torch.tensor(ends, dtype=torch.float32, device="cpu").unsqueeze(1).expand(2, *shape)
+    low, high = torch.from_numpy(acted.ends).unsqueeze(1).expand(2, *shape)
     return Bounded(low, high, shape=shape, dtype=torch.float32, device="cpu")
 
 
@@ -271,32 +311,68 @@ def _same_spaces(pool: Sequence[GymTask]) -> Rule:
     """Return the rule that tasks can be rows of one environment."""
     forms = []
     for task in pool:
-        observed, acted = spaces_of(task)
-        form = f"{observed.dtype} {list(task.observation_shape)} with actions {acted}"
+        observed, acted = make_forms(task)
+        form = f"{np.dtype(observed.dtype)} {list(observed.shape)} with actions {acted.form}"
         if form not in forms:
             forms.append(form)
     rule = f"tasks of one environment must have observations and actions of one form, got {', '.join(forms)}"
     return len(forms) == 1, rule
 
 
+def _name(task: GymTask) -> str:
+    """Return an environment with its task, for errors."""
+    label = task.label_parts["task"]
+    return task.id if label == task.id else f"{task.id} ({label})"
+
+
+def _reset(env: Any, seed: int) -> Any:
+    """Return what an environment's reset with a seed returns."""
+    try:
+        return env.reset(seed=seed)
+    except TypeError as error:
+        if "argument" not in str(error):
+            raise
+        fix = "write reset(self, *, seed=None, options=None)"
+        raise ValueError(f"it cannot be reset with a seed: {error}; {fix}") from error
+
+
 @cache
-def _repeats_rule(task: GymTask) -> Rule:
+def _repeats_rule(task: GymTask, key: Any) -> Rule:
     """Return the rule that an episode repeats with its seed: in one environment, and in another."""
     if not task.repeats:
         return True, ""
-    first = task.make()
-    other = task.make()
-    same = _play_probe(first) == _play_probe(first) == _play_probe(other)
+    envs: list[Any] = []
+    try:
+        envs += [task.make()]
+        envs += [task.make()]
+        first, other = envs
+        same = _play_probe(task, first) == _play_probe(task, first) == _play_probe(task, other)
+    finally:
+        for env in envs:
+            close_env(env)
     return same, f"an episode of {task.id} must repeat with its seed and actions, and it does not: {FIX}"
 
 
-def _play_probe(env: Any) -> list[bytes]:
-    """Return what an episode of random actions shows."""
+def _play_probe(task: GymTask, env: Any) -> list[Any]:
+    """Return what an episode of random actions shows.
+
+    Raises:
+        ValueError: if it cannot be played, with the step.
+        FloatingPointError: for numbers that are not finite.
+    """
+    observed, _ = make_forms(task)
     env.action_space.seed(0)
-    shown = [np.asarray(env.reset(seed=0)[0]).tobytes()]
-    for _ in range(NUM_PROBED):
-        observation, reward, terminated, truncated, _ = env.step(env.action_space.sample())
-        shown.append(np.asarray(observation).tobytes() + np.float64(reward).tobytes() + bytes([terminated, truncated]))
-        if terminated or truncated:
-            break
+    shown: list[Any] = []
+    try:
+        shown.append(observed.read_first(_reset(env, 0)).tobytes())
+        for _ in range(NUM_PROBED):
+            taken = observed.read_step(env.step(env.action_space.sample()))
+            shown.append((taken.observation.tobytes(), taken.reward, taken.terminated, taken.truncated))
+            if taken.terminated or taken.truncated:
+                break
+    except Exception as error:  # of an environment of anyone
+        kind = FloatingPointError if isinstance(error, FloatingPointError) else ValueError
+        cause = "" if isinstance(error, (FloatingPointError, ValueError)) else f"{type(error).__name__}: "
+        place = f"step {len(shown)} of an episode of random actions with seed 0"
+        raise kind(f"{_name(task)}: {cause}{error} ({place})") from error
     return shown

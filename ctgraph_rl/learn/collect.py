@@ -19,7 +19,7 @@ from ctgraph_rl.core.region import Region, captures
 from ctgraph_rl.core.row_params import RowParams
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.tasks.curriculum import Curriculum
-from ctgraph_rl.tasks.kinds.task_like import TaskLike
+from ctgraph_rl.tasks.kinds.task_like import TaskLike, close_env
 from ctgraph_rl.tasks.task import are_graphs
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
@@ -60,7 +60,11 @@ def make_env(
     kind = type(pool[0])
     env = kind.make_env(tasks, seed, task_pool=pool, device=device, task_ids=task_ids, num_task_ids=length or None)
     if not isinstance(env, CTGraphEnv):
-        require(*_env_rules(env, kind.__name__, len(tasks), length))
+        try:
+            require(*_env_rules(env, kind.__name__, len(tasks), length))
+        except ValueError:
+            close_env(env)
+            raise
     return env
 
 
@@ -90,7 +94,10 @@ def agent_specs(curriculum: Curriculum) -> Specs:
     if are_graphs(pool):
         return specs_of(pool, num_task_ids=length)
     env = make_env(curriculum, pool[:1], 0)
-    return Specs(env.observation_spec_unbatched, env.action_spec_unbatched)
+    try:
+        return Specs(env.observation_spec_unbatched, env.action_spec_unbatched)
+    finally:
+        close_env(env)
 
 
 def _pool_and_ids(curriculum: Curriculum) -> tuple[tuple[TaskLike, ...], int]:

@@ -6,7 +6,7 @@ Seeds that are trained as one batch are no collective, as they share nothing; se
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -143,8 +143,9 @@ def learn_collective(
     _check(members, exchange)
     exchange.connect([member.agent for member in members])
     collective = _Collective(members, exchange, Mail(exchange.drop_prob, exchange.delay_prob, seed), log)
-    collective.start(checked_device(device), saved)
-    run_loop(collective, progress, checkpoint)
+    with closing(collective):
+        collective.start(checked_device(device), saved)
+        run_loop(collective, progress, checkpoint)
     return log
 
 
@@ -257,6 +258,11 @@ class _Collective:
             self.mail.load_state_dict(saved["mail"])
             with saved_state_fits():
                 self.exchange.load_state_dict(saved["exchange"])
+
+    def close(self) -> None:
+        """Close the environments of all members that have begun."""
+        for learner in self.learners:
+            learner.steps.close()
 
     @property
     def frames(self) -> int:

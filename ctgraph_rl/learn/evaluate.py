@@ -26,7 +26,7 @@ from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.metrics.adaptation import exact_search
 from ctgraph_rl.policies import RandomPolicy
 from ctgraph_rl.tasks.curriculum import Curriculum
-from ctgraph_rl.tasks.kinds.task_like import TaskLike, require_tasks
+from ctgraph_rl.tasks.kinds.task_like import TaskLike, close_env, require_tasks
 from ctgraph_rl.tasks.protocol import Evaluation
 from ctgraph_rl.tasks.task import Task
 
@@ -90,12 +90,15 @@ def evaluate(
         env = type(tasks[0]).make_env(rows, seed, device=device)
     else:
         env = make_env(curriculum, rows, seed, device)
-    acts = _built_on(env, policy) if isinstance(policy, type) else as_policy(policy, num_actions(env))
     exploration = ExplorationType.DETERMINISTIC if greedy else ExplorationType.RANDOM
-    with torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []):
-        torch.manual_seed(seed)
-        with set_exploration_type(exploration):
-            result = _first_episodes(env, acts, initial_state, episodes_per_row)
+    try:
+        acts = _built_on(env, policy) if isinstance(policy, type) else as_policy(policy, num_actions(env))
+        with torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []):
+            torch.manual_seed(seed)
+            with set_exploration_type(exploration):
+                result = _first_episodes(env, acts, initial_state, episodes_per_row)
+    finally:
+        close_env(env)
     return result.view(len(tasks), num_episodes)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 
 import torch
 
@@ -74,6 +74,7 @@ def learn_curriculum(
             checkpoint(lambda: make_states()[0], at_block_end)
 
     with ExitStack() as stack:
+        stack.enter_context(closing(members))
         if isinstance(progress, bool):
             bar = ProgressBar(len(curriculum.blocks), curriculum.num_frames)
             progress = stack.enter_context(bar) if progress else None

@@ -24,6 +24,7 @@ from ctgraph_rl.learn.refusals import check_adaptation, check_env, check_exact, 
 from ctgraph_rl.learn.segments import Segment, announced_id, collect_segment, guided, log_training, segments
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.kinds.task_like import close_env
 
 SavedState = ReadOnlyValues
 """All that the rest of a member's run depends on, as tensors and plain values."""
@@ -189,7 +190,6 @@ class Lockstep:
         self.seeds = seeds
         self.logs = logs
         self.env = self._make_env(device)
-        check_env(curriculum, self.env)
         self.can_resume = True
         self.evaluators = [Evaluator(curriculum, seed, log, device) for seed, log in zip(seeds, logs, strict=True)]
         self.frames: int = 0 if saved is None else saved[0]["frames"]
@@ -212,10 +212,19 @@ class Lockstep:
         count = len(self.seeds)
         tasks = count * self.curriculum.blocks[0].rows(num_envs)
         env = make_env(self.curriculum, tasks, self.seeds[0], device)
-        if self.group.generators is not None:
-            seed = torch.tensor(self.seeds, device=device, dtype=torch.int64).repeat_interleave(num_envs)
-            env.rows.set_streams(seed, torch.arange(num_envs, device=device).repeat(count))
+        try:
+            check_env(self.curriculum, env)
+            if self.group.generators is not None:
+                seed = torch.tensor(self.seeds, device=device, dtype=torch.int64).repeat_interleave(num_envs)
+                env.rows.set_streams(seed, torch.arange(num_envs, device=device).repeat(count))
+        except BaseException:
+            close_env(env)
+            raise
         return env
+
+    def close(self) -> None:
+        """Close the environment; nothing is learned after it."""
+        close_env(self.env)
 
     @property
     def block(self) -> int:

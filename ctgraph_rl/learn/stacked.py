@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import closing
 
 import torch
 
@@ -65,5 +66,6 @@ def learn_together(
     """
     device = checked_device(device)
     members = Lockstep(curriculum, group, seeds, logs, device=device, saved=saved)
-    run_loop(members, progress, checkpoint)
+    with closing(members):
+        run_loop(members, progress, checkpoint)
     return members.failed

@@ -28,6 +28,7 @@ from ctgraph_rl.core.rewards import REWARD_FNS
 from ctgraph_rl.disk import write_whole
 from ctgraph_rl.strict import json_object
 from ctgraph_rl.tasks.images import IMAGE_SETS
+from ctgraph_rl.tasks.kinds.frozen_arguments import DictArgument, TupleArgument, from_json
 from ctgraph_rl.tasks.kinds.gym_task import GymTask
 from ctgraph_rl.tasks.kinds.task_like import TaskLike, is_kind
 from ctgraph_rl.tasks.memory import bank_bytes
@@ -54,7 +55,7 @@ MAX_BANK_BYTES = 2**36
 _KEYS = ("schema", "fingerprint", "name", "version", "source", "tasks", "blocks", "evaluation", "protocol")
 _DERIVED = "about"
 
-_CHOSEN = (*IMAGE_SETS, *REWARD_FNS.values(), *SWITCHES)
+_CHOSEN = (*IMAGE_SETS, *REWARD_FNS.values(), *SWITCHES, TupleArgument, DictArgument)
 """Types of which a curriculum has one of several, so that JSON names it."""
 
 _OURS = (*_CHOSEN, Task, CTGraph, Observations, Block, Evaluation, Protocol)
@@ -238,7 +239,9 @@ def _parts(content: ReadOnlyValues) -> NamedValues:
 def _task(content: Any) -> TaskLike:
     if not isinstance(content, Mapping) or "type" not in content:
         return _graph(content)
-    task = _built(_kind(content["type"]), _without_type(content), {})
+    kind = _kind(content["type"])
+    arguments = {"kwargs": from_json, "wrappers": from_json} if kind is GymTask else {}
+    task = _built(kind, _without_type(content), arguments)
     known = ("ctgraph_rl", "curricula", "gymnasium")
     needed = [name for name in getattr(task, "modules", ()) if name not in sys.modules]
     unknown = [name for name in needed if name.partition(".")[0] not in known]

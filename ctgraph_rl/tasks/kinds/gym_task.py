@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cache, partial
 from importlib import import_module
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from ctgraph_rl.checks import as_tuple, is_int, is_real, make_fields_plain, require, true_or_false
+from ctgraph_rl.tasks.kinds.frozen_arguments import by_name, thaw
+from ctgraph_rl.tasks.kinds.gym_spaces import ActionForm, ObservationForm
 from ctgraph_rl.tasks.kinds.registry import environment
+from ctgraph_rl.tasks.kinds.task_like import close_env
 
 if TYPE_CHECKING:
     import gymnasium
@@ -19,28 +23,42 @@ if TYPE_CHECKING:
 WITH_TABLE = ("gymnasium.envs.toy_text.frozen_lake", "gymnasium.envs.toy_text.cliffwalking")
 """Modules of environments that step only by their table of transitions ``P``."""
 
+ALREADY = {
+    "max_episode_steps": "give it as GymTask(max_episode_steps=...)",
+    "disable_env_checker": "the checker is always off",
+    "id": "it is the first argument of GymTask",
+}
+"""Arguments of ``gymnasium.make`` that an environment is not given by ``kwargs``, and why."""
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class GymTask:
     """An environment of Gymnasium: any id with a time limit whose observations are images, vectors or integers.
 
-    Images are uint8 [height, width] or [height, width, channels], and are shown channels first. Vectors are shown as
-    float32, and integers as one-hot. Actions are integers; our agents refuse continuous ones. Nothing else is needed
-    for a learner of one's own.
+    Images are uint8 and are shown channels first, vectors as float32, and integers as one-hot; see
+    `ctgraph_rl.tasks.kinds.gym_spaces.ObservationForm`. Actions are integers; our agents refuse continuous ones.
+    Nothing else is needed for a learner of one's own.
 
     Every episode begins with ``reset(seed=...)``. Its seed follows from the run's seed, the row and the number of the
     row's episode, so that a run repeats. A stopped run resumes by the seeds of the present episodes and their actions.
 
+    Two tasks are equal if all arguments are, and of the same types: ``True``, ``1`` and ``1.0`` differ, and a list
+    differs from a tuple.
+
     Args:
         id: of the environment; ``module:Name-v0`` imports the module that registers it first.
-        kwargs: arguments of the environment by name: numbers, texts, true or false, None, and lists of them.
+        kwargs: arguments of the environment by name: numbers, texts, true or false, None, and lists, tuples and dicts
+            of them. They arrive as written; arrays arrive as lists.
         wrappers: wrap the environment one after the other: classes, or functions of an environment, by ``module:name``.
-        max_episode_steps: the time limit, which truncates an episode; None: that of the id.
+            One with arguments is a pair, such as ``("gymnasium.wrappers:FrameStackObservation", {"stack_size": 4})``.
+        max_episode_steps: the time limit, which truncates an episode; None: that of the id or of a wrapper
+            ``TimeLimit``.
         label: short name in tables; None: the id with its arguments.
         return_range: the lowest and the highest return of an episode, where you know them and the best policy always
             gets the highest. None: computed within the time limit for environments of `WITH_TABLE`, and else unknown.
         repeats: whether an episode repeats with its seed and actions. If not, a stopped run resumes from its last
             announced block.
+        channels: where images have their channels, ``first`` or ``last``; None: found by the length of the axis.
 
     Raises:
         ValueError: for a value that breaks a rule; what the environment itself refuses is found when it is first made.
@@ -51,36 +69,52 @@ class GymTask:
     """
 
     id: str
-    kwargs: Any = ()  # held as pairs in the order of their names
-    wrappers: Any = ()  # held as a tuple of names
+    kwargs: Any = ()  # held as pairs in the order of their names, see `ctgraph_rl.tasks.kinds.frozen_arguments`
+    wrappers: Any = ()  # held as a tuple of names, and of pairs of a name and arguments
     max_episode_steps: int | None = None
     label: str | None = None
     return_range: tuple[float, float] | None = None
     repeats: bool = True
+    channels: str | None = field(default=None, metadata={"added": True})
 
     def __post_init__(self) -> None:
         make_fields_plain(self)
-        object.__setattr__(self, "kwargs", _frozen_kwargs(self.kwargs))
+        object.__setattr__(self, "kwargs", by_name("kwargs", self.kwargs))
         wrappers = as_tuple(self.wrappers)
-        wrappers = tuple(map(_import_name, wrappers)) if isinstance(wrappers, tuple) else wrappers
-        object.__setattr__(self, "wrappers", wrappers)
-        names = isinstance(wrappers, tuple) and all(isinstance(each, str) and ":" in each for each in wrappers)
+        form = "[FlattenObservation, 'my_module:MyWrapper', (FrameStackObservation, {'stack_size': 4})]"
+        rule = f"wrappers must be a list of classes, functions or their names, such as {form}, got {self.wrappers!r}"
+        require((isinstance(wrappers, tuple), rule))
+        object.__setattr__(self, "wrappers", tuple(_frozen_wrapper(each, rule) for each in wrappers))  # type: ignore[attr-defined]
         limit = self.max_episode_steps
         pair = self.return_range
         in_order = isinstance(pair, tuple) and len(pair) == 2 and is_real(pair[0]) and is_real(pair[1], pair[0])
+        arguments = dict(self.kwargs)
+        human = "render_mode must be 'rgb_array', which AddRenderObservation shows, or left out: 'human' opens windows"
+        channels = f"channels must be 'first', 'last' or None, got {self.channels!r}"
         require(
             (isinstance(self.id, str) and bool(self.id), f"id must be the id of an environment, got {self.id!r}"),
-            (names, f"wrappers must be classes or functions, or names such as my_module:MyWrapper, got {wrappers!r}"),
+            (arguments.get("render_mode") != "human", human),
+            *((name not in arguments, f"kwargs must leave out {name}: {why}") for name, why in ALREADY.items()),
             (limit is None or is_int(limit, 1), f"max_episode_steps must be an integer >= 1, got {limit!r}"),
             (self.label is None or isinstance(self.label, str), f"label must be a text, got {self.label!r}"),
             (pair is None or in_order, f"return_range must be the lowest and the highest return, got {pair!r}"),
+            (self.channels in (None, "first", "last"), channels),
             *true_or_false(repeats=self.repeats),
         )
+        plain = (self.id, self.max_episode_steps, self.label, self.return_range, self.repeats, self.channels)
+        object.__setattr__(self, "_key", (*plain, repr(self.kwargs), repr(self.wrappers)))
+
+    def __eq__(self, other: object) -> bool:
+        return self._key == other._key if type(other) is type(self) else NotImplemented  # type: ignore[attr-defined]
+
+    def __hash__(self) -> int:
+        return hash(self._key)  # type: ignore[attr-defined]
 
     @property
     def label_parts(self) -> dict[str, str]:
         """One part: the label."""
-        given = [f"{name}={value}" for name, value in self.kwargs if not isinstance(value, tuple)]
+        kinds = (bool, int, float, str, type(None))
+        given = [f"{name}={value}" for name, value in self.kwargs if isinstance(value, kinds)]
         return {"task": self.label or " ".join([self.id, *given])}
 
     @property
@@ -91,18 +125,12 @@ class GymTask:
     @property
     def observation_shape(self) -> tuple[int, ...]:
         """The shape of an observation that is shown."""
-        space = spaces_of(self)[0]
-        if _is_integer(space):
-            return (int(space.n),)
-        height_first = tuple(map(int, space.shape))
-        if len(height_first) == 1:
-            return height_first
-        return (1, *height_first) if len(height_first) == 2 else (height_first[2], *height_first[:2])
+        return make_forms(self)[0].shape
 
     @property
     def num_actions(self) -> int | None:
         """The number of actions; None where they are continuous."""
-        return int(spaces_of(self)[1].n) if _is_integer(spaces_of(self)[1]) else None
+        return make_forms(self)[1].num_actions
 
     @property
     def modules(self) -> tuple[str, ...]:
@@ -112,7 +140,8 @@ class GymTask:
         module, _, name = self.id.rpartition(":")
         spec = None if module else gymnasium.registry.get(name)
         entry = spec.entry_point if spec is not None and isinstance(spec.entry_point, str) else ""
-        found = (module, entry.partition(":")[0], *(each.partition(":")[0] for each in self.wrappers))
+        names = [each if isinstance(each, str) else each[0] for each in self.wrappers]
+        found = (module, entry.partition(":")[0], *(name.partition(":")[0] for name in names))
         return tuple(filter(None, dict.fromkeys(found)))
 
     @classmethod
@@ -128,22 +157,22 @@ class GymTask:
         """
         import gymnasium
 
-        kwargs = {name: list(value) if isinstance(value, tuple) else value for name, value in self.kwargs}
+        kwargs = {name: thaw(value) for name, value in self.kwargs}
+        env: Any = None
         try:
-            env = gymnasium.make(self.id, self.max_episode_steps, disable_env_checker=True, **kwargs)
-            limit = env.spec.max_episode_steps if env.spec is not None else None
-            for name in self.wrappers:
-                env = _object_named(name)(env)
-        except Exception as error:  # of an environment of anyone
-            raise ValueError(f"GymTask({self.id!r}) cannot be made: {type(error).__name__}: {error}") from error
-        flatten = "add the wrapper gymnasium.wrappers:FlattenObservation, or one of your own"
-        shown = env.observation_space
-        actions = env.action_space
-        require(
-            (limit is not None, f"{self.id} has no time limit, so an episode may never end: give max_episode_steps"),
-            (_is_shown(shown), f"{self.id} shows {shown}, which cannot be stacked as images or vectors: {flatten}"),
-            (_is_integer(actions) or _is_box(actions), f"{self.id} takes {actions}: actions must be integers or a Box"),
-        )
+            try:
+                env = gymnasium.make(self.id, self.max_episode_steps, disable_env_checker=True, **kwargs)
+                for wrapper in self.wrappers:
+                    env = _wrapped(env, wrapper)
+            except Exception as error:  # of an environment of anyone
+                raise ValueError(f"GymTask({self.id!r}) cannot be made: {type(error).__name__}: {error}") from error
+            limit = "has no time limit, so an episode may never end: give max_episode_steps"
+            require((time_limit(env) is not None, f"{self.id} {limit}"))
+            _read_forms(self, env)
+        except BaseException:
+            if env is not None:
+                close_env(env)
+            raise
         return env
 
     def optimal_value(self, gamma: float) -> float:
@@ -168,29 +197,46 @@ class GymTask:
         return _extreme_return(self, np.nanmin), _extreme_return(self, np.nanmax)
 
 
+def time_limit(env: Any) -> int | None:
+    """Return the shortest time limit among the wrappers of an environment; None without one."""
+    from gymnasium import Wrapper
+    from gymnasium.wrappers import TimeLimit
+
+    limits = []
+    while isinstance(env, Wrapper):
+        if isinstance(env, TimeLimit):
+            limits.append(env._max_episode_steps)
+        env = env.env
+    return min(limits, default=None)
+
+
+def registered(task: GymTask) -> tuple[Any, ...]:
+    """Return what is registered under a task's id now, for caches: a notebook registers an id again."""
+    from gymnasium import registry
+
+    spec = registry.get(task.id.rpartition(":")[2])
+    return () if spec is None else (spec.entry_point, spec.max_episode_steps, repr(spec.kwargs))
+
+
+def make_forms(task: GymTask) -> tuple[ObservationForm, ActionForm]:
+    """Return how a task's observations are shown and its actions given."""
+    return _make_forms(task, registered(task))
+
+
 @cache
-def spaces_of(task: GymTask) -> tuple[Any, Any]:
-    """Return the spaces of a task's observations and actions."""
+def _make_forms(task: GymTask, key: Any) -> tuple[ObservationForm, ActionForm]:
     env = task.make()
     try:
-        return env.observation_space, env.action_space
+        return _read_forms(task, env)
     finally:
-        env.close()
+        close_env(env)
 
 
-def _is_integer(space: Any) -> bool:
-    return type(space).__name__ == "Discrete"
-
-
-def _is_box(space: Any) -> bool:
-    return type(space).__name__ == "Box"
-
-
-def _is_shown(space: Any) -> bool:
-    """Return whether a space is of integers, vectors or images."""
-    if not _is_box(space):
-        return _is_integer(space)
-    return len(space.shape) == 1 or (len(space.shape) in (2, 3) and space.dtype == np.uint8)
+def _read_forms(task: GymTask, env: Any) -> tuple[ObservationForm, ActionForm]:
+    try:
+        return ObservationForm(env.observation_space, task.channels), ActionForm(env.action_space)
+    except ValueError as error:
+        raise ValueError(f"{task.id} {error}") from None
 
 
 class _Table(NamedTuple):
@@ -204,24 +250,31 @@ class _Table(NamedTuple):
     limit: int  # steps of an episode
 
 
-@cache
 def _table(task: GymTask) -> _Table:
-    env = task.make()
-    inner = env.unwrapped
-    known = type(inner).__module__ in WITH_TABLE and not task.wrappers
-    fix = "give return_range where you know it"
-    require((known, f"the best mean return of {task.id} is not known, it has no table of transitions: {fix}"))
-    transitions = inner.P  # type: ignore[attr-defined]
+    return _read_table(task, registered(task))
+
+
+@cache
+def _read_table(task: GymTask, key: Any) -> _Table:
+    env: Any = task.make()
+    try:
+        inner = env.unwrapped
+        known = type(inner).__module__ in WITH_TABLE and not task.wrappers
+        fix = "give return_range where you know it"
+        require((known, f"the best mean return of {task.id} is not known, it has no table of transitions: {fix}"))
+        transitions = inner.P
+        initial = np.asarray(inner.initial_state_distrib)
+        limit = time_limit(env)
+    finally:
+        close_env(env)
+    assert limit is not None, "`make` requires one"
     most = max(len(outcomes) for of_state in transitions.values() for outcomes in of_state.values())
     padded = np.zeros((len(transitions), len(transitions[0]), most, 4))
     for state, of_state in transitions.items():
         for action, outcomes in of_state.items():
             padded[state, action, : len(outcomes)] = outcomes
     probs, following, rewards, ends = np.moveaxis(padded, -1, 0)
-    initial = np.asarray(inner.initial_state_distrib)  # type: ignore[attr-defined]
-    limit = env.spec.max_episode_steps  # type: ignore[union-attr]
-    following = following.astype(np.int64)
-    return _Table(probs, following, rewards, ends, initial=initial, limit=limit)  # type: ignore[arg-type]
+    return _Table(probs, following.astype(np.int64), rewards, ends, initial=initial, limit=limit)
 
 
 def _best_mean_return(task: GymTask, gamma: float) -> float:
@@ -248,36 +301,35 @@ def _extreme_return(task: GymTask, choose: Callable[..., Any]) -> float:
     return float(choose(values[table.initial > 0]))
 
 
-def _frozen_kwargs(kwargs: Any) -> tuple[tuple[str, Any], ...]:
-    """Return arguments as pairs in the order of their names.
-
-    Raises:
-        ValueError: for values that JSON has no form for, and a way to render, which an agent does not see.
-    """
-    pairs: Any = kwargs.items() if isinstance(kwargs, Mapping) else as_tuple(kwargs)
-    try:
-        given = {name: as_tuple(value) for name, value in pairs}
-    except (TypeError, ValueError):
-        given = {"": object()}
-    rule = f"kwargs must be plain values by name, such as {{'is_slippery': False}}, got {kwargs!r}"
-    plain = all(isinstance(name, str) and name and _is_plain(value) for name, value in given.items())
-    require((plain, rule), ("render_mode" not in given, "kwargs must leave out render_mode: nothing is rendered"))
-    return tuple(sorted(given.items()))
-
-
-def _is_plain(value: Any) -> bool:
-    if isinstance(value, tuple):
-        return all(map(_is_plain, value))
-    return value is None or isinstance(value, (bool, int, float, str))
-
-
-def _import_name(wrapper: Any) -> Any:
-    """Return ``module:name`` of a class or function; anything else unchanged."""
-    named = callable(wrapper) and hasattr(wrapper, "__qualname__")
-    return f"{wrapper.__module__}:{wrapper.__qualname__}" if named else wrapper
+def _frozen_wrapper(wrapper: Any, rule: str) -> Any:
+    """Return the name of a wrapper, or a pair of name and arguments where it is given some."""
+    given: Any = ()
+    if isinstance(wrapper, partial):
+        given = wrapper.keywords
+        require(
+            (not wrapper.args, f"a partial function of a wrapper needs its arguments by name, got {wrapper!r:.200}")
+        )
+        wrapper = wrapper.func
+    elif isinstance(wrapper, (tuple, list)) and len(wrapper) == 2:
+        wrapper, given = wrapper
+    name = wrapper
+    if callable(wrapper) and hasattr(wrapper, "__qualname__"):
+        name = f"{wrapper.__module__}:{wrapper.__qualname__}"
+    require((isinstance(name, str) and ":" in name, rule))
+    found = not {"<lambda>", "<locals>"} & set(name.replace(":", ".").split("."))
+    fix = "define it by class or def at the top of a module"
+    require((found, f"the wrapper {name} has no name by which another process finds it, got {wrapper!r}: {fix}"))
+    arguments = by_name(f"arguments of the wrapper {name}", given)
+    return (name, arguments) if arguments else name
 
 
-def _object_named(name: str) -> Any:
-    """Return the class or function of ``module:name``."""
+def _wrapped(env: Any, wrapper: Any) -> Any:
+    """Return an environment with a wrapper around it."""
+    from gymnasium import Env
+
+    name, arguments = (wrapper, ()) if isinstance(wrapper, str) else wrapper
     module, _, own_name = name.partition(":")
-    return getattr(import_module(module), own_name)
+    wrap = attrgetter(own_name)(import_module(module))
+    found = wrap(env, **{key: thaw(value) for key, value in arguments})
+    require((isinstance(found, Env), f"the wrapper {name} must return a gymnasium.Env, got {found!r:.80}"))
+    return found

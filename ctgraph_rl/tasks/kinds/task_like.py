@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any, Protocol
@@ -13,8 +14,8 @@ class TaskLike(Hashable, Protocol):
     """A task of any kind: a frozen dataclass with the four members below, equal and hashable by value.
 
     Its fields are plain values, tuples of them, or such dataclasses again. So the fingerprint of a curriculum covers
-    them and JSON holds them. `ctgraph_rl.Task` is the first kind, `ctgraph_rl.tasks.kinds.gym_task.GymTask` the second.
-    All tasks of a curriculum are of one kind, as one environment holds them.
+    them and JSON holds them. `ctgraph_rl.Task` is the first kind, `ctgraph_rl.GymTask` the second.
+    All tasks of a curriculum are of one kind, as one environment holds them. What makes an environment closes it.
 
     Further members are optional. ``resumes`` says that the environment can be saved: a new one continues with the same
     bits after ``load_state_dict(state_dict())``. Without it a stopped run resumes from its last announced block.
@@ -137,3 +138,13 @@ def require_tasks(values: Iterable[TaskLike]) -> tuple[Any, ...]:
     require((is_list, message))
     require(*are_tasks("tasks", tasks))
     return tuple(values)
+
+
+def close_env(env: Any) -> None:
+    """Close an environment. One that fails is named, and raises nothing: a run's results or first error come first."""
+    try:
+        if hasattr(env, "close"):
+            env.close()
+    except Exception as error:  # of an environment of anyone
+        name = type(getattr(env, "unwrapped", env)).__name__
+        print(f"note: {name} failed to close: {error!r:.200}", file=sys.stderr)

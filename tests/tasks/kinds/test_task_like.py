@@ -61,7 +61,7 @@ def test_a_curriculum_of_another_kind_has_labels_a_fingerprint_and_json():
 def test_the_same_task_is_equal_however_its_arguments_are_given():
     pairs = GymTask("FrozenLake-v1", [["is_slippery", False], ["desc", ["SF", "FG"]]])
 
-    assert pairs == GymTask("FrozenLake-v1", {"desc": ("SF", "FG"), "is_slippery": False})
+    assert pairs == GymTask("FrozenLake-v1", {"desc": ["SF", "FG"], "is_slippery": False})
     assert hash(pairs) == hash(replace(pairs))
     assert GymTask("A-v0", wrappers=[FlattenObservation]).wrappers[0].endswith(":FlattenObservation")
 
@@ -77,9 +77,9 @@ def test_the_same_task_is_equal_however_its_arguments_are_given():
         (lambda: Curriculum("c", 1, "-", (Block((Whole(), Whole((4,), 3)), 8),)), r"as many actions, got \[2, 3\]"),
         (lambda: Curriculum("c", 1, "-", (Block((Whole(), Whole((5,))), 8),)), r"one shape, got \[\(4,\), \(5,\)\]"),
         (lambda: GymTask(""), "id must be the id of an environment, got ''"),
-        (lambda: GymTask("A-v0", {"a": {1: 2}}), "kwargs must be plain values by name, .* got {'a': {1: 2}}"),
-        (lambda: GymTask("A-v0", {"render_mode": "human"}), "kwargs must leave out render_mode"),
-        (lambda: GymTask("A-v0", wrappers=("Flatten",)), r"names such as my_module:MyWrapper, got \('Flatten',\)"),
+        (lambda: GymTask("A-v0", {"a": {1, 2}}), "kwargs must be plain values by name, .* got {'a': {1, 2}}"),
+        (lambda: GymTask("A-v0", {"render_mode": "human"}), "render_mode must be 'rgb_array', .*'human' opens"),
+        (lambda: GymTask("A-v0", wrappers=("Flatten",)), r"such as .*'my_module:MyWrapper', .* got \('Flatten',\)"),
         (lambda: GymTask("A-v0", max_episode_steps=0), "max_episode_steps must be an integer >= 1, got 0"),
         (lambda: GymTask("A-v0", return_range=(1, 0)), r"return_range must be the lowest and the highest .*\(1, 0\)"),
     ],
