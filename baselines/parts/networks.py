@@ -281,7 +281,7 @@ def num_actions_of(action_spec: TensorSpec) -> int:
     count = getattr(action_spec, "n", None)
     shape = list(action_spec.shape)
     dtype = str(action_spec.dtype).removeprefix("torch.")
-    fix = "take a learner of your own, measured by Recorder, or a task with discrete ones"
+    fix = "take a learner of your own, measured by Recorder, or the wrapper gymnasium.wrappers:DiscretizeAction"
     require((count is not None, f"agents of baselines choose from discrete actions, these are {dtype} {shape}: {fix}"))
     return count  # type: ignore[return-value]
 

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ctgraph_rl.batch.specs import Specs, specs_of
-from ctgraph_rl.checks import Rule, at_least_one, is_int, require
+from ctgraph_rl.checks import Rule, at_least_one, is_int, require, takes_numbers
 from ctgraph_rl.core.dynamics import RowState, beside
 from ctgraph_rl.core.region import Region, captures
 from ctgraph_rl.core.row_params import RowParams
@@ -45,6 +45,7 @@ Step = dict[Any, Tensor]
 """What was seen, done and written in a step of all rows, and under keys ``("next", key)`` what came after it."""
 
 
+@takes_numbers
 def make_env(
     curriculum: Curriculum, tasks: Sequence[TaskLike], seed: int, device: torch.device | str = "cpu"
 ) -> EnvBase:
@@ -107,6 +108,7 @@ def _pool_and_ids(curriculum: Curriculum) -> tuple[tuple[TaskLike, ...], int]:
     return pool, how.length(len(curriculum.tasks)) if how.task_id == "one_hot" else 0
 
 
+@takes_numbers
 def collect(
     env: EnvBase,
     policy: Policy,

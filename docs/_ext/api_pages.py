@@ -40,8 +40,7 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "ctgraph_rl.tasks.values",
             "ctgraph_rl.tasks.similarity",
             "ctgraph_rl.tasks.observability",
-            "ctgraph_rl.tasks.kinds.task_like:TaskLike",
-            "ctgraph_rl.tasks.kinds.gym_task:GymTask",
+            "ctgraph_rl.tasks.kinds.gym_spaces:ObservationForm",
         ),
     ),
     "learning": (
