@@ -58,7 +58,7 @@ class ObservationForm:
         channels: where an image has its channels, ``first`` or ``last``; None: by the rule above.
 
     Raises:
-        ValueError: for other spaces, with the wrapper to add, and images whose channels cannot be told.
+        ValueError: for other spaces, with the wrapper to add, and images whose channels are not clear.
     """
 
     def __init__(self, space: Any, channels: str | None = None) -> None:
@@ -93,7 +93,7 @@ class ObservationForm:
             self.shape = (math.prod(sizes[:-2]), *sizes[-2:])
 
     def read(self, observation: Any) -> NDArray[Any]:
-        """Return an observation as it is shown.
+        """Return an observation in the form in which it is shown.
 
         Raises:
             ValueError: for what the space does not hold.
@@ -280,7 +280,7 @@ def _place_of_channels(space: Any) -> str:
         pixels = shape[2:] if first else shape[1:3]
         known = known and shape[0] < min(pixels)
     fix = "give GymTask(channels='first') or GymTask(channels='last')"
-    require((known, f"shows {_in_words(space)}, and it cannot be told which axis of an image is the channels: {fix}"))
+    require((known, f"shows {_in_words(space)}, and which axis of an image is the channels is not clear: {fix}"))
     return "first" if first else "last"
 
 

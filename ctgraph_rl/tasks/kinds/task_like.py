@@ -15,7 +15,7 @@ class TaskLike(Hashable, Protocol):
 
     Its fields are plain values, tuples of them, or such dataclasses again. So the fingerprint of a curriculum covers
     them and JSON holds them. `ctgraph_rl.Task` is the first kind, `ctgraph_rl.GymTask` the second.
-    All tasks of a curriculum are of one kind, as one environment holds them. What makes an environment closes it.
+    All tasks of a curriculum are of one kind, as one environment holds them. Runs and evaluations close it.
 
     Further members are optional. ``resumes`` says that the environment can be saved: a new one continues with the same
     bits after ``load_state_dict(state_dict())``. Without it a stopped run resumes from its last announced block.

@@ -108,8 +108,8 @@ def test_a_stack_of_frames_with_channels_has_the_channels_of_all_frames(shape, a
 @pytest.mark.parametrize(
     "shape", [(3, 6, 3), (5, 6, 7), (2, 5, 6), (8, 5, 6), (5, 6, 3, 4), (4, 5, 6, 7), (2, 3, 6, 3)]
 )
-def test_channels_that_cannot_be_told_are_refused_with_the_fix(shape):
-    message = "cannot be told which axis of an image is the channels: give GymTask.channels='first'. or"
+def test_channels_that_are_not_clear_are_refused_with_the_fix(shape):
+    message = "which axis of an image is the channels is not clear: give GymTask.channels='first'. or"
 
     with pytest.raises(ValueError, match=message):
         _ = task_of(shape).observation_shape
