@@ -6,18 +6,14 @@ memory or time than its file says. Every error is a ``ValueError`` of one line.
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 import json
 import math
 import os
 import re
 import stat
-import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -36,18 +32,6 @@ LONG_NUMBER = re.compile("[0-9]" * (LONGEST_NUMBER + 1))
 
 MAX_DEPTH = 32
 """Folders within each other in which files are looked for."""
-
-LONGEST_CELL = 2**16
-"""Bytes of a text in a Parquet file."""
-
-BYTES_PER_CELL, LEAST_TABLE = 64, 2**20
-"""Largest Parquet file, for each cell that it should have, and for a file of any size."""
-
-LEAST_UNPACKED, TIMES = 2**24, 50
-"""What a file of gzip of any size may hold, and more for each of its bytes: logs have some ten."""
-
-CODECS = ("SNAPPY", "UNCOMPRESSED")
-"""Compressions of Parquet files: none makes more than some twenty times its size."""
 
 
 @contextmanager
@@ -200,144 +184,6 @@ def yaml_value(content: bytes) -> Any:
         return yaml.load(content.decode("utf-8"), Loader=_Plain)
     except (yaml.YAMLError, RecursionError) as error:
         raise ValueError(f"must be YAML: {' '.join(str(error).split())}") from None
-
-
-def csv_rows(
-    content: bytes, columns: Sequence[str], key: Sequence[str], most: int, read: Callable[[str], str] = str
-) -> list[dict[str, str]]:
-    """Return the rows of a CSV text in UTF-8 with exactly these columns.
-
-    Args:
-        content: the text.
-        columns: names, in order.
-        key: columns whose values together are in one row only.
-        most: rows that it may have.
-        read: gives the value of a cell.
-
-    Raises:
-        ValueError: for other columns, a row of another width, more rows, and two rows of one key.
-    """
-    text = content.decode("utf-8")
-    require(
-        ("\r" not in text.replace("\r\n", ""), "must end lines with a line feed, got a carriage return without one")
-    )
-    try:
-        rows = list(islice(csv.reader(io.StringIO(text, newline=""), strict=True), most + 2))
-    except csv.Error as error:
-        raise ValueError(f"must be CSV: {error}") from None
-    header = rows[0] if rows else []
-    require((header == list(columns), f"must have the columns {', '.join(columns)}, got {', '.join(header):.200}"))
-    require((len(rows) <= most + 1, f"has more than {most:,} rows, the limit"))
-    wrong = next((number for number, row in enumerate(rows, 1) if len(row) != len(columns)), None)
-    require((wrong is None, f"must have {len(columns)} cells in every line, line {wrong} has others"))
-    found = []
-    lines: dict[tuple[str, ...], int] = {}
-    for number, cells in enumerate(rows[1:], 2):
-        row = dict(zip(columns, map(read, cells), strict=True))
-        values = tuple(row[name] for name in key)
-        first = lines.setdefault(values, number)
-        require((first == number, f"lines {first} and {number} are both of {', '.join(values):.200}: leave one out"))
-        found.append(row)
-    return found
-
-
-def unpacked(content: bytes, most: int) -> bytes:
-    """Return what a file of gzip holds.
-
-    Raises:
-        ValueError: for what is none, more than ``most`` bytes, more than `TIMES` its size beyond `LEAST_UNPACKED`, a
-            torn file, and what follows its end.
-    """
-    most = min(most, LEAST_UNPACKED + TIMES * len(content))
-    unpack = zlib.decompressobj(31)  # the format of gzip
-    try:
-        found = unpack.decompress(content, most + 1)
-    except zlib.error as error:
-        raise ValueError(f"is no file of gzip: {error}; restore it") from None
-    require((len(found) <= most, f"holds more than {most:,} bytes, the limit"))
-    require(
-        (unpack.eof, "ends too early: restore it"),
-        (not unpack.unused_data, "has more after its end, which programs read or leave out: restore it"),
-    )
-    return found
-
-
-def parquet_rows(content: bytes, like: bytes) -> list[NamedValues]:
-    """Return the rows of a Parquet file that should be as another one; nothing is unpacked before its form is known.
-
-    Args:
-        content: the file.
-        like: one with the same columns and as many rows.
-
-    Raises:
-        ValueError: for what is none, other columns, more rows, and texts of more than `LONGEST_CELL` bytes.
-    """
-    from pyarrow import ArrowException, BufferReader, parquet
-
-    wanted = parquet.ParquetFile(BufferReader(like))
-    cells = wanted.metadata.num_rows * wanted.metadata.num_columns
-    most = LEAST_TABLE + BYTES_PER_CELL * cells
-    require((len(content) <= most, f"it has {len(content):,} bytes, {most:,} are enough for its rows"))
-    texts = [field.name for field in wanted.schema_arrow if str(field.type) == "string"]
-    try:
-        _check_table(parquet.read_metadata(BufferReader(content)), wanted.metadata)
-        table = parquet.ParquetFile(BufferReader(content), read_dictionary=texts).read()
-    except (ArrowException, OSError, OverflowError, MemoryError) as error:
-        raise ValueError(" ".join(str(error).split())) from None
-    for name in texts:
-        for chunk in table.column(name).chunks:
-            longest = max((len(text) for text in chunk.dictionary.to_pylist() if text is not None), default=0)
-            require((longest <= LONGEST_CELL, f"a text in {name} has {longest:,} bytes, the limit is {LONGEST_CELL:,}"))
-    return table.to_pylist()
-
-
-def _check_table(given: Any, wanted: Any) -> None:
-    """Refuse a Parquet file of another form than was wanted, by what it says of itself."""
-    rows = given.num_rows
-    require((rows <= wanted.num_rows, f"it has {rows:,} rows, the logs give {wanted.num_rows:,}"))
-    columns = _forms(given)
-    known = _forms(wanted)
-    require((columns == known, f"it has the columns {_listed(columns)}, the logs give {_listed(known)}"))
-    groups = [given.row_group(number) for number in range(min(given.num_row_groups, rows + 1))]
-    parts: list[Any] = []
-    for group in groups:
-        parts += map(group.column, range(group.num_columns))
-    require((not _ends_process(lambda: [part.compression for part in parts]), "its compression is unknown"))
-    require(
-        (given.num_row_groups <= rows + 1, f"it has {given.num_row_groups:,} groups of {rows:,} rows"),
-        (sum(group.num_rows for group in groups) == rows, "its groups have other numbers of rows than it says"),
-        (all(part.compression in CODECS for part in parts), f"its compression must be one of {', '.join(CODECS)}"),
-        (all(0 <= part.num_values <= rows for part in parts), "a column has other numbers of values than it has rows"),
-    )
-
-
-def _ends_process(look: Callable[[], object]) -> bool:
-    """Return whether a look into a file ends the process, as that at an unknown compression does in pyarrow.
-
-    A forked process tries it; where there is none, as on Windows, nothing is tried.
-    """
-    if not hasattr(os, "fork"):
-        return False
-    child = os.fork()
-    if child == 0:
-        try:
-            os.close(2)  # to which the C++ library writes as it aborts
-            look()
-        finally:
-            os._exit(0)
-    return os.waitpid(child, 0)[1] != 0
-
-
-def _forms(table: Any) -> list[tuple[str, str, str, int]]:
-    """Return the name and the type of each column; that of a list has a longer path and deeper levels."""
-    forms = []
-    for column in map(table.schema.column, range(table.num_columns)):
-        forms.append((column.path, column.physical_type, str(column.logical_type), column.max_repetition_level))
-    return forms
-
-
-def _listed(columns: Sequence[tuple[str, str, str, int]]) -> str:
-    return f"{', '.join(f'{path} {kind}' for path, kind, _, _ in columns):.200}"
 
 
 def files_below(folder: Path, names: Sequence[str] = ()) -> tuple[list[Path], list[Path]]:

@@ -36,7 +36,6 @@ WRITING = {
 
 ALLOWED = {
     ("ctgraph_rl.board.isolate", "os.open"): "reads a folder",
-    ("ctgraph_rl.board.submit", "yaml.dump"): "into a text",
     ("ctgraph_rl.board.relearn", "run_dir.mkdir"): "in the folder of a process",
     ("ctgraph_rl.core.kernel", "folder.mkdir"): "the user's own cache, which no other can write to",
     ("ctgraph_rl.core.kernel", "tempfile.TemporaryDirectory"): "as above",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 import re
 import shutil
 import subprocess
@@ -12,6 +13,7 @@ from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers.made_runs import write_run
 from hypothesis import given, settings
@@ -126,9 +128,18 @@ def test_csv_starts_no_formula_and_is_read_back(rows):
         for value, cell in zip(row, cells, strict=True):
             if isinstance(value, str):
                 assert not cell.startswith(("=", "+", "-", "@", "\t", "\r"))
-                assert escape.from_csv(cell) == value
+                assert cell.removeprefix(escape.MARK) == value
             else:
                 assert cell == ("" if value is None else repr(value))
+
+
+def test_a_number_in_csv_is_a_number_and_a_text_that_looks_like_one_is_guarded():
+    numbers = [-1e-05, -0.0, -3, -0.05, float("-inf"), np.float64(-2.5)]
+
+    (read,) = csv.reader(io.StringIO(escape.csv_text([[*numbers, "-3", "-1e-05"]]), newline=""))
+
+    assert list(map(float, read[:6])) == numbers and math.copysign(1, float(read[1])) == -1
+    assert read[6:] == ["'-3", "'-1e-05"]
 
 
 @given(NAMES)
@@ -232,7 +243,7 @@ def test_figures_and_tables_are_made_of_hostile_names(tmp_path):
 
     assert all(re.fullmatch(r"[\w.=-]+", path.name) for path in (tmp_path / "report" / "figures").iterdir())
     labels_read = {row["label"] for row in csv.DictReader((tmp_path / "evaluations.csv").open(newline=""))}
-    assert {escape.from_csv(label) for label in labels_read} == set(labels)
+    assert {label.removeprefix(escape.MARK) for label in labels_read} == set(labels)
 
 
 def test_a_curriculum_is_described_and_drawn_whatever_its_name(tmp_path):

@@ -48,7 +48,7 @@ def test_the_wheel_holds_the_packages_and_the_configuration_and_nothing_else(whe
     rest = {name for name in found - code - conf if ".dist-info/" not in name}
     typed = {f"{package}/py.typed" for package in ("ctgraph_rl", "curricula", "baselines")}
     report = {f"ctgraph_rl/report/{name}" for name in ("report.html.j2", "report.md.j2", "style.mplstyle")}
-    report |= {f"ctgraph_rl/board/standings/{name}" for name in ("board.html.j2", "board.js", "croissant_context.json")}
+    report |= {f"ctgraph_rl/board/standings/{name}" for name in ("board.html.j2", "board.js")}
     assert report <= rest <= {*typed, *report, "curricula/fingerprints.json", "ctgraph_rl/core/kernel.c"}
 
 

@@ -1,7 +1,7 @@
 """The code of others in a separate process: limits of time, memory and disk, and what the system can close off.
 
-On Linux bubblewrap closes off everything but the process's own folder; see `ctgraph_rl.board.bubblewrap`. Limits hold
-on every POSIX system; `Isolation` says what is open and what is not limited.
+bubblewrap closes off everything but the process's own folder; see `ctgraph_rl.board.bubblewrap`. Without it nothing
+runs. `Isolation` says what is open and what is not limited.
 ``python -m ctgraph_rl.board.isolate`` is the first thing that runs in the new process: no module of others can be
 imported before its limits are set.
 """
@@ -19,7 +19,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -75,17 +75,12 @@ class Isolation(NamedTuple):
         return [f"bubblewrap {self.bubblewrap}", "no network", inside, "it changes only its folder", other]
 
     def missing(self) -> list[str]:
-        """Return a text for each thing that the code of others could do here."""
-        if self.bubblewrap is None:
-            return [
-                "it can do all that you can: read and change every file of yours, use the network, signal your other "
-                "processes and read their environment, and leave some behind",
-                *([] if PROC.is_dir() else ["its memory is limited for each process, not for all together"]),
-            ]
+        """Return a text for each thing that is not closed off or not limited."""
         root = "the system holds root to no number of processes: a burst of them is stopped once it is seen"
         cards = "graphics cards: it may use all of their memory and of their driver"
         return [
             "weaknesses of the kernel stay, and what the processor's caches tell of other programs",
+            "it can see which files are opened in the folders that it reads (inotify)",
             "the kernel's own memory for it is not limited, such as buffers of pipes and sockets; neither are files "
             "that it removed and keeps in a socket",
             f"memory, disk and processes are looked at {1 / SECONDS_BETWEEN_LOOKS:g} times a second",
@@ -118,7 +113,6 @@ def isolation(folder: Path, graphics: bool = False) -> Isolation:
         folder: an existing directory for that process.
         graphics: whether the code of others may use the graphics cards.
     """
-    require((os.name == "posix", "verify needs a POSIX system to limit the code of others; use Linux or macOS"))
     folder = _prepared(folder)
     why_not = bubblewrap.why_not(folder, _environment(folder))
     found = None if why_not is not None else ".".join(map(str, bubblewrap.version() or ()))
@@ -149,27 +143,37 @@ def run_isolated(
         watch: is called several times a second.
 
     Raises:
-        ValueError: for a limit that is not positive.
+        ValueError: for a limit that is not positive, and without bubblewrap.
     """
-    require(*positive(seconds=limits.seconds, memory=limits.memory, disk=limits.disk))
+    require(
+        *positive(seconds=limits.seconds, memory=limits.memory, disk=limits.disk),
+        (isolated.bubblewrap is not None, f"the code of others is not run: {isolated.why_not}"),
+    )
     folder = _prepared(folder)
     found_in = [str(path.resolve()) for path in paths]
-    spec = json.dumps([limits, isolated.bubblewrap is not None, found_in, module, *arguments])
+    spec = json.dumps([limits, found_in, module, *arguments])
     command = [sys.executable, "-P", "-s", "-m", HERE, spec]
     start = time.monotonic()
-    with ExitStack() as stack:
-        opened: tuple[int, ...] = ()
-        if isolated.bubblewrap is not None:
-            opened = (stack.enter_context(bubblewrap.program()),)
-            command = bubblewrap.confined(command, folder, paths, filtering=opened[0], graphics=isolated.graphics)
-        environment = {**_environment(folder), **(variables or {})}
-        process = stack.enter_context(_process(command, folder, environment, opened))
-        said = _Tail(process.stdout)
-        stopped = _watched(process, folder, limits, watch)
-        if stopped is not None:
-            _kill(process)
-        code = process.wait()
+    environment = {**_environment(folder), **(variables or {})}
+    with bubblewrap.program() as filtering:
+        command = bubblewrap.confined(command, folder, paths, filtering=filtering, graphics=isolated.graphics)
+        try:
+            with _process(command, folder, environment, (filtering,)) as process:
+                said = _Tail(process.stdout)
+                stopped = _watched(process, folder, limits, watch)
+                if stopped is not None:
+                    _kill(process)
+                code = process.wait()
+        finally:
+            strip_privileges(folder)
     return Outcome(code, stopped, time.monotonic() - start, said.text())
+
+
+def strip_privileges(folder: Path) -> None:
+    """Remove the setuid and setgid bits of files and folders."""
+    chosen = ["-xdev", "(", "-type", "f", "-o", "-type", "d", ")", "-perm", "/6000"]
+    command = ["find", str(folder), *chosen, "-execdir", "chmod", "a-s", "--", "{}", "+"]
+    subprocess.run(command, env={"PATH": "/usr/bin:/bin"}, stderr=subprocess.DEVNULL)
 
 
 class _Tail(threading.Thread):
@@ -372,8 +376,8 @@ def _opened(entry: os.DirEntry[str], folder: int | Path, depth: int, files: int)
 
 def main() -> None:
     """Set the limits, and run the module that the first argument names, with its arguments."""
-    limits, is_confined, paths, *called = json.loads(sys.argv[1])
-    _limit(Limits(*limits), is_confined)
+    limits, paths, *called = json.loads(sys.argv[1])
+    _limit(Limits(*limits))
     # not before: Python imports a sitecustomize that it finds, and modules of these names in place of those of Python
     sys.path += paths
     os.environ["PYTHONPATH"] = os.pathsep.join([os.environ["PYTHONPATH"], *paths])
@@ -381,7 +385,7 @@ def main() -> None:
     runpy.run_module(called[0], run_name="__main__", alter_sys=True)
 
 
-def _limit(limits: Limits, is_confined: bool) -> None:
+def _limit(limits: Limits) -> None:
     """Set the limits that the system holds, of this process and of each that it starts."""
     import resource  # here: only POSIX systems have it
 
@@ -391,9 +395,8 @@ def _limit(limits: Limits, is_confined: bool) -> None:
         resource.RLIMIT_CPU: math.ceil(limits.seconds) * (os.cpu_count() or 1),
         resource.RLIMIT_CORE: 0,
         resource.RLIMIT_NOFILE: MOST_OPEN,
+        resource.RLIMIT_NPROC: MOST_THREADS,
     }
-    if is_confined:  # elsewhere it counts all processes of the user
-        wanted[resource.RLIMIT_NPROC] = MOST_THREADS
     for kind, value in wanted.items():
         hard = resource.getrlimit(kind)[1]
         most = min(value, LARGEST_INT if hard == resource.RLIM_INFINITY else hard)

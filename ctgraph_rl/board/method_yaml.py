@@ -204,7 +204,7 @@ def facts_of(protocol: Protocol, runs: Sequence[Any]) -> dict[str, NamedValues]:
 
     Args:
         protocol: of what they learned.
-        runs: lines of ``runs.csv``.
+        runs: the submitted runs.
     """
     given = {key: getattr(protocol, key) for key in EXAMPLE["given"]}
     shared: dict[Any, float] = {}
@@ -224,7 +224,7 @@ def fact_rules(
     Args:
         method: what a ``method.yaml`` holds.
         facts: what the runs say.
-        runs: lines of ``runs.csv``.
+        runs: the submitted runs.
         num_tasks: of the curriculum.
     """
     hours = method["compute"]["hours"]

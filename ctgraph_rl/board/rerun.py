@@ -20,10 +20,10 @@ from typing import NamedTuple
 from ctgraph_rl.board.isolate import Isolation, Limits, Outcome, run_isolated
 from ctgraph_rl.board.relearn import Relearning, run_dir_of
 from ctgraph_rl.board.rescore import NO_ROW, Check, differing, equal
-from ctgraph_rl.board.submission import MOST_BYTES_OF_A_FILE, Submission, SubmittedRun, counted, experts_of, log_sum
+from ctgraph_rl.board.submission import Submission, SubmittedRun, counted, experts_of, log_sum
 from ctgraph_rl.board.two_samples import compare_samples
 from ctgraph_rl.checks import ReadOnlyValues, are_ints, is_int, require
-from ctgraph_rl.disk import made_folder, open_own, read_regular, read_text, require_no_link, write_whole
+from ctgraph_rl.disk import made_folder, open_own, read_text, require_no_link, write_whole
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CURRICULUM, FAILURE, LOG, METRICS, MOST_BYTES_OF_A_REASON
 from ctgraph_rl.log.provenance import machine, numbers_of, versions
@@ -35,6 +35,7 @@ from ctgraph_rl.portable import VARIABLES, cpu_model
 from ctgraph_rl.runs.read import split_by
 from ctgraph_rl.strict import json_value
 from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.curriculum_json import file_text
 
 RERUN = LEVELS[1]
 
@@ -92,7 +93,7 @@ class Rerun(NamedTuple):
     """What a seed that was learned again has left."""
 
     log: RunLog | None
-    agent_sha256: str
+    agent_sha256: str | None
     failure: str | None  # why it has no results
     agent_bytes: int | None = None  # of its tensors; None if it saved none
     experts: tuple[RunLog, ...] = ()  # logs of its single-task experts
@@ -159,8 +160,7 @@ def job_of(
     cores = os.cpu_count() or 1
     few = f"{run.run} had {run.num_threads} threads, this machine has {cores} cores: verify it on a larger one"
     require((entry is not None or run.num_threads <= cores, few))
-    given = submission.path.resolve() / "curriculum.json" if entry is not None and curriculum is None else curriculum
-    path = None if given is None else str(given)
+    path = None if curriculum is None else str(curriculum)
     together = bool(run.group) and len(seeds) > 1
     return Relearning(seeds, together, submission.config, run.num_threads, entry_point=entry, curriculum=path)
 
@@ -200,10 +200,10 @@ def learn_again(
 
 def _with_its_curriculum(cell: RerunCell) -> Relearning:
     """Return the job of a cell with the file of its curriculum in the cell's folder, where its process sees it."""
-    if cell.job.curriculum is None:
+    if cell.job.curriculum is None and cell.job.entry_point is None:
         return cell.job
     own = cell.folder.resolve() / CURRICULUM
-    write_whole(own, read_regular(Path(cell.job.curriculum), MOST_BYTES_OF_A_FILE))
+    write_whole(own, file_text(cell.curriculum.to_json()))
     return cell.job._replace(curriculum=str(own))
 
 
@@ -223,10 +223,10 @@ def result_of(cell: RerunCell, seed: int, outcome: Outcome) -> Rerun:
         log = RunLog.read(run_dir / LOG)
         has_agent = (run_dir / AGENT).exists()
         state = read_plain(read_content(run_dir / AGENT)) if has_agent else None
-        agent, size = (sum_of_state(state), count_bytes(state)) if has_agent else ("", None)
+        agent, size = (sum_of_state(state), count_bytes(state)) if has_agent else (None, None)
         return Rerun(log, agent, None, size, _experts(cell.folder.resolve(), log))
     except (ValueError, OSError) as error:
-        return Rerun(None, "", str(error))
+        return Rerun(None, None, str(error))
 
 
 def _experts(folder: Path, log: RunLog) -> tuple[RunLog, ...]:
@@ -245,8 +245,8 @@ def _failed(run_dir: Path, outcome: Outcome) -> Rerun:
     with suppress(OSError, ValueError):
         reason = read_text(run_dir / FAILURE, MOST_BYTES_OF_A_REASON).strip()
         alone = outcome.stopped is None and not reason.startswith(NOT_OF_THE_RUN)
-        return Rerun(None, "", reason, failed_alone=alone)
-    return Rerun(None, "", outcome.failure or f"it left no {METRICS}")
+        return Rerun(None, None, reason, failed_alone=alone)
+    return Rerun(None, None, outcome.failure or f"it left no {METRICS}")
 
 
 def why_other_bits(submission: Submission, runs: Sequence[SubmittedRun]) -> list[str]:
@@ -260,7 +260,7 @@ def why_other_bits(submission: Submission, runs: Sequence[SubmittedRun]) -> list
     about = submission.log(runs[0]).measurements[0]
     stored = about.get("numbers", 1)
     here = numbers_of(about)
-    fix = "install the versions of versions.txt"
+    fix = "install the versions that submission.json names"
     require((stored == here, f"the runs have numbers version {stored}, this ctgraph_rl has {here}: {fix}"))
     portable = is_portable(submission.config)
     this = {**machine(), "cpu": cpu_model() or ""}
@@ -295,7 +295,7 @@ def checks_of(run: SubmittedRun, submitted: RunLog, result: Rerun, experts: Sequ
     if not run.finished:
         again = True if result.failed_alone else None
         found = terminal_text(result.failure or "it finished")
-        return [Check("failure", run.reason, found, again, run=run.run, level=RERUN)]
+        return [Check("failure", str(run.reason), found, again, run=run.run, level=RERUN)]
     if result.log is None:
         note = "--code DIR says where its modules are" if "ModuleNotFoundError" in str(result.failure) else ""
         return [Check("rerun", "it finishes", terminal_text(result.failure), None, run.run, note=note, level=RERUN)]
@@ -380,8 +380,9 @@ def verified(submission: Submission, results: Mapping[SubmittedRun, Rerun], othe
     without_bits: list[Check] = []
     scored: list[float | None] = []
     for run, result in results.items():
-        experts = submission.experts(run) if run.finished else None
-        checks = checks_of(run, submission.log(run), result, experts or ())
+        log = submission.log(run)
+        experts = submission.experts(run, log) if run.finished else None
+        checks = checks_of(run, log, result, experts or ())
         every += checks
         wrong = [check for check in checks if check.passed is False and check.what != BYTES]
         if run.finished and wrong and result.log is not None and other_bits:

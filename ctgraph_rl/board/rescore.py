@@ -1,54 +1,29 @@
-"""Level *rescored* of a verification: what a submission says is what its own logs give.
+"""Level *rescored* of a verification: a submission's logs are those that it names, and whole, and all rules hold.
 
-All metrics and evaluations are computed again from the logs and compared, digit by digit on one kind of machine. It
-runs no code of the submission. Logs may still be made up: a rerun finds that.
+Its scores are computed from the logs, here and on a board. It runs no code of the submission. Logs may still be made
+up: a rerun finds that.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping, Sequence
-from itertools import zip_longest
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from ctgraph_rl.board.method_yaml import fact_rules, facts_of, track_version
-from ctgraph_rl.board.submission import (
-    CONFIG,
-    EVALUATIONS,
-    LOGS,
-    METHOD,
-    METRIC_COLUMNS,
-    METRICS,
-    RUNS,
-    VERSIONS,
-    Submission,
-    SubmittedRun,
-    experts_of,
-    log_sum,
-)
-from ctgraph_rl.board.submission_rules import curriculum_rule, entry_rule, one_line, oracle_rule, seed_rules
-from ctgraph_rl.checks import ReadOnlyValues, Rule, is_real
-from ctgraph_rl.disk import read_regular
+from ctgraph_rl.board.submission import Submission, SubmittedRun, experts_of, log_sum
+from ctgraph_rl.board.submission_rules import curriculum_rule, entry_rule, oracle_rule, seed_rules
+from ctgraph_rl.checks import ReadOnlyValues, Rule, require
 from ctgraph_rl.learn.evaluate import Evaluator
-from ctgraph_rl.log.escape import csv_text, listed
-from ctgraph_rl.log.provenance import machine
-from ctgraph_rl.log.run_log import MOST_BYTES, RunLog
+from ctgraph_rl.log.escape import listed
+from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.scores import scores
-from ctgraph_rl.log.tables import evaluations_parquet, require_parquet
-from ctgraph_rl.metrics import Metric
 from ctgraph_rl.parsers import LEVELS
-from ctgraph_rl.runs.read import MODIFIED
 from ctgraph_rl.runs.settings import differences
-from ctgraph_rl.strict import named, parquet_rows
 
 RESCORED = LEVELS[0]
 
 MEASURES = ("average_performance", "forgetting")
 """Metrics that each table of a board shows beside the score of its track."""
-
-ROUNDING = 1e-9
-"""Largest difference, as a share of the value, between what two kinds of machines compute from one log."""
-
 
 NO_ROW: ReadOnlyValues = {}
 
@@ -86,20 +61,27 @@ def rescore(submission: Submission) -> list[Check]:
     """Check what a submission says by its own files.
 
     Raises:
-        ModuleNotFoundError: without pyarrow; names the extra to install.
         ValueError: for files that cannot be read.
         OSError: if a file cannot be read.
     """
-    require_parquet()
     checks = [*_of_the_whole(submission)]
-    finished = {}
     for run in submission.runs:
-        log = submission.log(run)
-        checks += _of_the_log(submission, run, log)
-        if run.finished:
-            finished[run] = log
-    checks += _of_metrics(submission, finished)
-    return checks + _of_evaluations(submission, list(finished.values()))
+        checks += _of_the_log(submission, run, submission.log(run))
+    return checks
+
+
+def scores_of(submission: Submission, run: SubmittedRun) -> dict[str, float | None]:
+    """Return what a board shows of a finished run, from its log: the score of the track and `MEASURES`.
+
+    Raises:
+        ValueError: if the log is another one than the submission names, or of another curriculum.
+    """
+    log = submission.log(run)
+    own = log_sum(log) == run.log_sha256
+    require((own, f"the log of {run.run} is another one than the submission names: restore it"))
+    found = scores(log, submission.curriculum, submission.experts(run, log))
+    names = MEASURES if submission.track is None else (submission.track.score, *MEASURES)
+    return {name: found[name].value for name in names}
 
 
 def _of_the_whole(submission: Submission) -> Iterator[Check]:
@@ -125,9 +107,7 @@ def _of_the_whole(submission: Submission) -> Iterator[Check]:
     facts = facts_of(submission.curriculum.protocol, runs)
     rules = fact_rules(method, facts, runs, len(submission.curriculum.tasks))
     said = {part: method[part] for part in facts}
-    yield _rules(METHOD, rules, str(facts), str(said))
-    failed = [run.seed for run in runs if not run.finished]
-    yield equal(f"failed seeds of {METHOD}", sorted(method["failed"]), failed)
+    yield _rules("method", rules, str(facts), str(said))
 
 
 def _rules(what: str, rules: Sequence[Rule], expected: str, found: str) -> Check:
@@ -143,15 +123,10 @@ def _of_the_log(submission: Submission, run: SubmittedRun, log: RunLog) -> Itera
     config = dict(about.get("config") or {})
     yield equal("seed", run.seed, config.pop("seed", None), run.run)
     changed = differences(config, submission.config)
-    yield Check(CONFIG, "equal settings", listed(changed) or "equal settings", not changed, run.run)
-    yield equal(VERSIONS, dict(submission.versions), about.get("versions"), run.run)
+    yield Check("config", "equal settings", listed(changed) or "equal settings", not changed, run.run)
+    yield equal("versions", dict(submission.versions), about.get("versions"), run.run)
     yield equal("curriculum of the log", submission.curriculum.fingerprint, about.get("fingerprint"), run.run)
-    yield equal(f"curriculum of {RUNS}", submission.curriculum.fingerprint, run.fingerprint, run.run)
-    named = str(about.get("curriculum")).removesuffix(MODIFIED)
-    yield equal(f"name of the curriculum in {RUNS}", named, run.curriculum, run.run)
-    yield equal(f"seconds of {RUNS}", (log.measurements or [{}])[-1].get("seconds", 0.0), run.seconds, run.run)
-    reason = "" if run.finished else one_line(submission.method["failed"].get(run.seed, ""))
-    yield equal(f"reason of {RUNS}", reason, run.reason, run.run)
+    yield equal("seconds", (log.measurements or [{}])[-1].get("seconds", 0.0), run.seconds, run.run)
     yield equal("group", run.group, tuple(about.get("together") or ()), run.run)
     stored = about.get("machine"), about.get("num_threads"), about.get("cpu")
     yield equal("machine", (run.machine, run.num_threads, run.cpu or None), stored, run.run)
@@ -163,7 +138,9 @@ def _of_the_log(submission: Submission, run: SubmittedRun, log: RunLog) -> Itera
 def _of_experts(submission: Submission, run: SubmittedRun, log: RunLog) -> Iterator[Check]:
     """Yield checks that the logs of experts are those that a log names."""
     said = experts_of(log)
-    alone = [expert.of_kind("run")[0] for expert in submission.experts(run) or ()]
+    experts = submission.experts(run, log) or ()
+    yield equal("sums of the logs of experts", run.experts, tuple(map(log_sum, experts)), run.run)
+    alone = [expert.of_kind("run")[0] for expert in experts]
     for what, key in (("curricula", "fingerprint"), ("groups", "together")):
         if said or what == "curricula":
             expected = [each.get(key) for each in said]
@@ -187,115 +164,3 @@ def of_the_protocol(submission: Submission, run: SubmittedRun, log: RunLog) -> I
         if some:
             notes.append(f"{what} (frames, task, episodes): {listed(sorted(some, key=str))}")
     yield Check("evaluations", str(len(wanted)), str(len(there)), wanted == there, run.run, note="; ".join(notes))
-
-
-def metrics_text(found: Mapping[SubmittedRun, Mapping[str, Metric]]) -> str:
-    """Return the content of ``metrics.csv``."""
-    rows = [list(METRIC_COLUMNS)]
-    for run, metrics in found.items():
-        rows += _metric_cells(run, metrics).values()
-    return csv_text(rows)
-
-
-def _metric_cells(run: SubmittedRun, metrics: Mapping[str, Metric]) -> dict[str, list[str]]:
-    """Return the cells of the lines of a run in ``metrics.csv``, by metric."""
-    found = {}
-    for name, metric in metrics.items():
-        value = "" if metric.value is None else repr(metric.value)
-        found[name] = [run.run, str(run.seed), name, value, metric.definition, metric.undefined or ""]
-    return found
-
-
-def near(one: object, other: object) -> bool:
-    """Return whether two values are equal up to the rounding of another machine."""
-    if not (is_real(one) and is_real(other)):
-        return one == other
-    return math.isclose(one, other, rel_tol=ROUNDING, abs_tol=ROUNDING)  # type: ignore[arg-type]
-
-
-def _of_metrics(submission: Submission, logs: Mapping[SubmittedRun, RunLog]) -> list[Check]:
-    """Return the checks of ``metrics.csv``: one for each difference, or one for all.
-
-    A metric that no run states may have been defined since, and is not missed unless a board shows it: the score of
-    the track and `MEASURES`.
-    """
-    same_kind = submission.scored_on == machine()["machine"]
-    wrong = []
-    count = 0
-    needed = set(MEASURES).union(*submission.metrics.values())
-    if submission.track is not None:
-        needed.add(submission.track.score)
-    more = sorted(set(submission.metrics) - {run.run for run in logs})
-    rule = "no finished run has this name"
-    if more:
-        wrong.append(Check(METRICS, "metrics of finished runs", listed(more), False, note=rule))
-    for run, log in logs.items():
-        try:
-            cells = _metric_cells(run, scores(log, submission.curriculum, submission.experts(run)))
-        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RuntimeError) as error:
-            wrong.append(Check(METRICS, "metrics of the log", "none", False, run.run, note=str(error)))
-            continue
-        stated = submission.metrics.get(run.run, {})
-        for name in {**cells, **stated}:
-            if name in needed:
-                count += 1
-                line = list(stated[name].values()) if name in stated else None
-                check = _of_metric(run.run, name, cells.get(name), line, same_kind)
-                wrong += [] if check is None else [check]
-    return wrong or [equal(METRICS, f"{count} values", f"{count} values")]
-
-
-def _of_metric(
-    run: str, name: str, cells: Sequence[str] | None, stated: Sequence[str] | None, same_kind: bool
-) -> Check | None:
-    """Return the check of a metric that is not what its log gives; None for one that is."""
-    if cells == stated:
-        return None
-    what = f"{name} in {METRICS}"
-    if cells is None or stated is None:
-        return Check(what, _value(cells), _value(stated), False, run)
-    if not same_kind and cells[4:] == stated[4:] and near(_number(cells[3]), _number(stated[3])):
-        return None
-    expected = []
-    found = []
-    for cell, other in zip(cells, stated, strict=True):
-        if cell != other:
-            expected.append(cell or "nothing")
-            found.append(other or "nothing")
-    return Check(what, ", ".join(expected), ", ".join(found), False, run)
-
-
-def _value(cells: Sequence[str] | None) -> str:
-    return "no line" if cells is None else cells[3] or "undefined"
-
-
-def _number(cell: str) -> object:
-    """Return a cell as a number if it is one, else its text."""
-    try:
-        return float(cell)
-    except ValueError:
-        return cell
-
-
-def _of_evaluations(submission: Submission, logs: Sequence[RunLog]) -> list[Check]:
-    """Return the checks of ``evaluations.parquet``: one for each row that differs, or one for all."""
-    with named(submission.path / LOGS):
-        table = evaluations_parquet(logs)
-        expected = parquet_rows(table, table)
-    try:
-        found = parquet_rows(read_regular(submission.path / EVALUATIONS, MOST_BYTES), table)
-    except ValueError as error:
-        return [Check(EVALUATIONS, f"{len(expected)} rows", "a file that cannot be read", False, note=str(error))]
-    wrong = []
-    for number, pair in enumerate(zip_longest(expected, found, fillvalue=NO_ROW), 1):
-        if pair[0] != pair[1]:
-            wrong.append(Check(f"row {number} of {EVALUATIONS}", *_differing(*pair), False))
-    return wrong or [equal(EVALUATIONS, f"{len(expected)} rows", f"{len(expected)} rows")]
-
-
-def _differing(one: ReadOnlyValues, other: ReadOnlyValues) -> tuple[str, str]:
-    """Return in words what two rows have where they differ."""
-    if not one or not other:
-        return ("a row" if one else "no row"), ("a row" if other else "no row")
-    names = differing(one, other)
-    return listed(f"{name}={one.get(name)}" for name in names), listed(f"{name}={other.get(name)}" for name in names)

@@ -31,11 +31,6 @@ MAY_BE_READ = ("", "the frames of each block")
 """What methods may read of tasks beside what the protocol gives: a track fixes the frames of its blocks."""
 
 
-def one_line(reason: str) -> str:
-    """Return the reason for a failed seed as ``runs.csv`` holds it."""
-    return " ".join(reason.split())
-
-
 def curriculum_rule(curriculum: Curriculum, of_track: Track | None) -> Rule:
     """Return the rule that a curriculum is one of a track, or without a track the published one of its name."""
     name = curriculum.name.removesuffix(MODIFIED)

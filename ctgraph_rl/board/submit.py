@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Mapping, Sequence
@@ -9,15 +10,11 @@ from itertools import filterfalse
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from ctgraph_rl import parsers
 from ctgraph_rl.board import submission as files
 from ctgraph_rl.board.method_yaml import TEMPLATE, completed, fact_rules, facts_of, read_method
-from ctgraph_rl.board.rescore import metrics_text, near, rescore
+from ctgraph_rl.board.rescore import rescore
 from ctgraph_rl.board.submission import (
-    FAILED,
-    FINISHED,
     Submission,
     SubmittedRun,
     experts_of,
@@ -25,35 +22,33 @@ from ctgraph_rl.board.submission import (
     log_sum,
     packed,
     read_submission,
-    runs_text,
-    versions_text,
+    submission_text,
 )
 from ctgraph_rl.board.submission_rules import (
     code_rules,
     curriculum_rule,
     entry_rule,
     failure_rules,
-    one_line,
     oracle_rule,
     same_rules,
     seed_rules,
 )
 from ctgraph_rl.board.tracks import Track, track
-from ctgraph_rl.checks import ReadOnlyValues, Rule, repeated, require
+from ctgraph_rl.checks import ReadOnlyValues, Rule, is_real, repeated, require
 from ctgraph_rl.disk import made_folder, new_folder, require_new, write_whole
 from ctgraph_rl.log.escape import listed, terminal_text
 from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG, locked_new
-from ctgraph_rl.log.provenance import machine
 from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.saved import count_bytes, read_content, read_plain, sum_of_state
 from ctgraph_rl.log.scores import scores
-from ctgraph_rl.log.tables import evaluations_parquet, require_parquet
 from ctgraph_rl.metrics import Metric
 from ctgraph_rl.runs.read import Run, find_runs, why_left_out
 from ctgraph_rl.runs.settings import flat
 from ctgraph_rl.tasks.curriculum import Curriculum
-from ctgraph_rl.tasks.curriculum_json import file_text
+
+ROUNDING = 1e-9
+"""Largest difference, as a share of the value, between what two kinds of machines compute from one log."""
 
 
 def submit(
@@ -79,9 +74,7 @@ def submit(
         ValueError: for runs that cannot be submitted; names every broken rule, before anything is written.
         FileExistsError: if the folder exists.
         BlockingIOError: if another process makes it.
-        ModuleNotFoundError: without pyarrow; names the extra to install.
     """
-    require_parquet()
     require_new(to)
     runs, curriculum = _checked(_found(paths, only or {}), method, of_track)
     names = _names(runs)
@@ -159,21 +152,20 @@ def _names(runs: Sequence[Run]) -> list[str]:
 
 
 def _line(run: Run, name: str, reasons: Mapping[int, str]) -> SubmittedRun:
-    """Return the line of a run in ``runs.csv``."""
+    """Return a run as ``submission.json`` has it."""
     log = RunLog.read(run.path / LOG)
     finished = run.reason is None
     state = _state(run.path / AGENT) if finished and (run.path / AGENT).exists() else None
+    experts = _experts(run).values() if finished else ()
     return SubmittedRun(
         run=name,
         seed=run.seed,
-        curriculum=run.group[0],
-        fingerprint=run.curriculum[1],
-        state=FINISHED if finished else FAILED,
-        reason="" if finished else one_line(reasons[run.seed]),
+        reason=None if finished else reasons[run.seed],
         group=tuple(run.about.get("together") or ()),
-        agent_sha256="" if state is None else sum_of_state(state),
+        agent_sha256=None if state is None else sum_of_state(state),
         agent_bytes=None if state is None else count_bytes(state),
         log_sha256=log_sum(log),
+        experts=tuple(log_sum(RunLog.read(path)) for path in experts),
         machine=str(run.about.get("machine", "")),
         num_threads=int(run.about.get("num_threads", 1)),
         cpu=str(run.about.get("cpu") or ""),
@@ -199,8 +191,6 @@ def _write(
 ) -> None:
     """Write all files of a submission."""
     made_folder(folder / files.LOGS)
-    logs = []
-    found = {}
     for run, line in zip(runs, lines, strict=True):
         write_whole(folder / log_name(line.run), packed((run.path / LOG).read_bytes()))
         if not line.finished:
@@ -208,31 +198,20 @@ def _write(
         experts = _experts(run)
         for number, path in experts.items():
             write_whole(folder / log_name(line.run, number), packed(path.read_bytes()))
-        logs.append(RunLog.read(run.path / LOG))
-        found[line] = scores(logs[-1], curriculum, list(map(RunLog.read, experts.values())) or None)
-        require(_metrics_rule(run, found[line]))
+        log = RunLog.read(run.path / LOG)
+        found = scores(log, curriculum, list(map(RunLog.read, experts.values())) or None)
+        require(_metrics_rule(run, found))
     config = dict(runs[0].about["config"])
     config.pop("seed", None)
-    write_whole(folder / files.METHOD, _yaml(method))
-    write_whole(folder / files.CONFIG, _yaml(config))
-    write_whole(folder / files.VERSIONS, versions_text(runs[0].about["versions"], machine()["machine"]))
-    write_whole(folder / CURRICULUM, file_text(curriculum.to_json()))
-    write_whole(folder / files.RUNS, runs_text(lines))
-    write_whole(folder / files.EVALUATIONS, evaluations_parquet(logs))
-    write_whole(folder / files.METRICS, metrics_text(found))
+    content = submission_text(method, config, runs[0].about["versions"], curriculum, tuple(lines))
+    write_whole(folder / files.SUBMISSION, content)
 
 
-def _yaml(content: ReadOnlyValues) -> str:
-    """Return plain values as YAML."""
-    return yaml.dump(dict(content), Dumper=_WithoutAliases, sort_keys=False, allow_unicode=True, width=120)
-
-
-class _WithoutAliases(yaml.SafeDumper):
-    """Writes a value that is there twice twice."""
-
-    def ignore_aliases(self, data: Any) -> bool:
-        """Return that no value is named."""
-        return True
+def near(one: object, other: object) -> bool:
+    """Return whether two values are equal up to the rounding of another machine."""
+    if not (is_real(one) and is_real(other)):
+        return one == other
+    return math.isclose(one, other, rel_tol=ROUNDING, abs_tol=ROUNDING)  # type: ignore[arg-type]
 
 
 def _metrics_rule(run: Run, found: Mapping[str, Metric]) -> Rule:

@@ -162,7 +162,7 @@ def describe_plan(plan: Plan, means: Means) -> list[str]:
     ]
     if plan.other_bits:
         lines.append(f"scores are tested where bits differ: {'; '.join(plan.other_bits)}")
-    lines.append(f"isolated: {'; '.join(means.isolation.closed()) or f'nothing, {means.isolation.why_not}'}")
+    lines.append(f"isolated: {'; '.join(means.isolation.closed())}")
     for text in means.isolation.missing():
         lines.append(f"NOT isolated: {text}")
     return list(map(terminal_text, lines))
@@ -339,13 +339,8 @@ def verify(submission: Submission, arguments: argparse.Namespace) -> list[Check]
     plan = planned(submission, arguments.level, number, arguments.cells, folder)
     paths = () if arguments.code is None else (arguments.code,)
     isolated = isolation(folder, graphics=submission.config.get("device", "cpu") != "cpu")
-    fix = "or give --not-isolated to run it with all that you can do"
-    require(
-        (
-            isolated.why_not is None or arguments.not_isolated,
-            f"the code of others is not run: {isolated.why_not}, {fix}",
-        )
-    )
+    why_not = isolated.why_not
+    require((why_not is None, f"the code of others is not run: {why_not}; --level {RESCORED} runs none"))
     means = Means(isolated, arguments.hours, memory=arguments.memory, disk=arguments.disk, paths=paths)
     ask(describe_plan(plan, means), arguments.yes)
     with (

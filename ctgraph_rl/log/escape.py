@@ -106,11 +106,6 @@ def _cell(value: Any) -> Any:
     return MARK + value if isinstance(value, str) and value.startswith(FORMULA) else value
 
 
-def from_csv(cell: str) -> str:
-    """Return the text that a cell of `csv_text` stands for."""
-    return cell.removeprefix(MARK)
-
-
 def utf8_text(text: object) -> object:
     """Return a text that UTF-8 can hold, with halves of surrogate pairs as in Python; any other value unchanged."""
     return text.encode("utf-8", "backslashreplace").decode() if isinstance(text, str) else text

@@ -51,6 +51,12 @@ MOST_CELLS = 10**7
 MOST_BYTES = 2**30
 """Largest log that is read: 1 GiB."""
 
+MOST_MEMORY, BYTES_OF_A_VALUE = 2**32, 100
+"""Memory that a log may take, 4 GiB, and bytes for each of its values: small records take many times their size."""
+
+VALUES = (b",", b":", b"{", b"[", b"\n")
+"""What stands between values of JSON."""
+
 FEW, BYTES_OF_A_NUMBER = 1000, 4
 """Blocks and tasks that a log of any size may have, and bytes of its file for each more."""
 
@@ -201,6 +207,8 @@ class RunLog:
     @classmethod
     def of_content(cls, content: bytes, path: Path | str) -> RunLog:
         """Return the log whose file has this content; see `read`. Errors name ``path``."""
+        needed = len(content) + BYTES_OF_A_VALUE * sum(map(content.count, VALUES))
+        require((needed <= MOST_MEMORY, f"{path} would take {needed:,} bytes of memory, the limit is {MOST_MEMORY:,}"))
         *lines, last = content.split(b"\n")
         log = cls()
         log._num_bytes = len(content)

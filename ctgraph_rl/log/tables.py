@@ -14,7 +14,7 @@ and in one, ``pandas.read_csv("evaluations.csv")`` or ``pandas.read_parquet("eva
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -91,21 +91,6 @@ def write_tables(log: RunLog, folder: Path | str, parquet: bool | None = None) -
             written.append(Path(folder) / f"{name}.parquet")
             write_whole(written[-1], _parquet(arrow, types, rows))
     return written
-
-
-def evaluations_parquet(logs: Iterable[RunLog]) -> bytes:
-    """Return the content of a Parquet file with the evaluations of several runs, in their order.
-
-    Raises:
-        ModuleNotFoundError: without pyarrow; names the extra to install.
-        ValueError: for more columns than a table may have.
-    """
-    logs = list(logs)
-    types = _types("evaluation", EVALUATIONS, *logs)
-    rows: list[list[Any]] = []
-    for log in logs:
-        rows += _rows(log, "evaluation", list(types))
-    return _parquet(_pyarrow(needed=True), types, rows)
 
 
 def check_table(path: Path) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 from argparse import ArgumentParser
 from collections.abc import Callable
-from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -55,14 +54,12 @@ def board() -> ArgumentParser:
     """Write a page with tables of submissions, and the same tables for programs.
 
     board.html needs nothing else and no network; board.md and tables.tex have the same tables; board.json,
-    entries.csv and scores.csv have their numbers, croissant.json describes the CSV files, and model-index.yaml is
-    the results file that model hubs read. The exit code is 1 if something was left out.
+    entries.csv and scores.csv have their numbers. The exit code is 1 if something was left out.
     """
     parser = _parser(board)
     _add(parser, "submissions", "submissions, or folders that hold them", nargs="+", metavar="DIR")
     _add(parser, "--out", "where the files go", required=True, metavar="FOLDER")
     _add(parser, "--config-dir", "folder with your own tracks, track/NAME.yaml", metavar="DIR")
-    _add(parser, "--date", "the day that the metadata names (default: today)", type=date.fromisoformat)
     return parser
 
 
@@ -229,7 +226,6 @@ def verify() -> ArgumentParser:
     _add(parser, "--memory", "memory limit of a process (default: %(default)g)", default=8.0, metavar="GB", type=float)
     _add(parser, "--disk", "disk limit of a process (default: %(default)g)", default=4.0, metavar="GB", type=float)
     parser.add_argument("--yes", action="store_true", help="skip the prompt despite incomplete isolation")
-    parser.add_argument("--not-isolated", action="store_true", help="run without bubblewrap")
     _add(parser, "--folder", "folder of the reruns (default: %(default)s)", default=Path("verify"), metavar="DIR")
     _add(parser, "--config-dir", "folder with your own track, track/NAME.yaml", metavar="DIR")
     return parser

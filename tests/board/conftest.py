@@ -85,7 +85,6 @@ def method() -> dict[str, Any]:
 @pytest.fixture(scope="session")
 def tiny_submission(tiny_home: Path, tiny_track: Track, method: dict[str, Any]) -> Submission:
     """A valid submission, which no test changes; ``submission`` is a copy."""
-    pytest.importorskip("pyarrow")
     return submit([tiny_home / "runs"], tiny_home / "submission", method, tiny_track)
 
 

@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import json
 import re
 import shutil
 import subprocess
 import sys
 from dataclasses import replace
-from datetime import date
 
 import pytest
+from helpers.submissions import edit, edit_run
 
 from ctgraph_rl import cli
 from ctgraph_rl.board import verify
-from ctgraph_rl.board.rescore import Check, rescore
+from ctgraph_rl.board.rescore import Check, rescore, scores_of
 from ctgraph_rl.board.standings.board_page import write_board
 from ctgraph_rl.board.standings.entries import FIELDS, make_entry, read_entries, verification_of
-from ctgraph_rl.board.submission import VERIFICATION, read_submission
+from ctgraph_rl.board.submission import VERIFICATION, log_name, log_sum, packed, read_submission
 
-for package in ("jinja2", "scipy", "pyarrow"):
+for package in ("jinja2", "scipy"):
     pytest.importorskip(package)
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -30,16 +29,14 @@ BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "
 @pytest.fixture
 def board(tiny_home, submission, tmp_path):
     """A board of one submission."""
-    return write_board([submission.path], tmp_path / "board", tiny_home / "conf", date(2026, 1, 2))
+    return write_board([submission.path], tmp_path / "board", tiny_home / "conf")
 
 
 def test_an_entry_has_the_numbers_of_its_submission(submission):
     found = make_entry(submission)
 
     assert (found.name, found.level, found.why_not_ranked) == ("Tiny PPO", "submitted", None)
-    assert found.scores == tuple(
-        float(submission.metrics[run.run]["average_performance"]["value"]) for run in submission.runs
-    )
+    assert found.scores == tuple(scores_of(submission, run)["average_performance"] for run in submission.runs)
     assert (found.seeds, found.frames, found.variant) == ((0, 1), 256, submission.track.variants[0])
     assert found.agent_bytes == submission.runs[0].agent_bytes and found.hours == submission.method["compute"]["hours"]
 
@@ -100,17 +97,28 @@ def test_what_is_no_verification_counts_for_nothing_and_the_board_says_why(tiny_
     assert entry.verification.why_none.startswith(f"verification.json counts for nothing, {why}")
 
 
-@pytest.mark.parametrize("cell", ["nan", "inf", "7", "abc", "0_1"])
-def test_a_value_that_the_metric_cannot_have_is_left_out_with_file_metric_and_run(tiny_home, submission, cell):
-    path = submission.path / "metrics.csv"
-    path.write_text(re.sub(r"(tiny-seed1,1,average_performance,)[\d.]+", rf"\g<1>{cell}", path.read_text()))
+def test_a_log_with_returns_that_the_metric_cannot_have_is_left_out_and_named(tiny_home, submission):
+    run = submission.runs[1]
+    log = submission.log(run)
+    for line in log.of_kind("evaluation"):
+        line["return_mean"] = 7.0
+    content = "".join(json.dumps(line) + "\n" for line in log.measurements).encode()
+    (submission.path / log_name(run.run)).write_bytes(packed(content))
+    edit_run(submission.path, 1, log_sha256=log_sum(log))
 
     entries, (problem,) = read_entries([submission.path], tiny_home / "conf")
 
-    wanted = "must be a finite number in [0, 1], got"
-    assert not entries and problem.reason == (
-        f"{submission.path}: metrics.csv: average_performance of tiny-seed1 {wanted} '{cell}'; verify the submission"
-    )
+    assert not entries
+    assert problem.reason == f"{submission.path}: the logs give average_performance 7.0, it must be in [0, 1]"
+
+
+def test_a_log_that_was_exchanged_since_is_left_out_and_named(tiny_home, submission):
+    first, second = (submission.path / log_name(run.run) for run in submission.runs)
+    first.write_bytes(second.read_bytes())
+
+    entries, (problem,) = read_entries([submission.path], tiny_home / "conf")
+
+    assert not entries and "the log of tiny-seed0 is another one than the submission names" in problem.reason
 
 
 def test_a_submission_to_an_earlier_version_of_a_track_is_in_a_table_of_its_own_and_fails_under_the_new_one(
@@ -118,14 +126,13 @@ def test_a_submission_to_an_earlier_version_of_a_track_is_in_a_table_of_its_own_
 ):
     conf = shutil.copytree(tiny_home / "conf", tmp_path / "conf")
     assert submission.method["track_version"] == 1
-    method, track = submission.path / "method.yaml", conf / "track" / "tiny.yaml"
-    method.write_text(method.read_text().replace("track_version: 1\n", ""))  # as before there were any
+    track = conf / "track" / "tiny.yaml"
     (before,) = read_entries([submission.path], conf)[0]
 
     track.write_text(track.read_text().replace("version: 1", "version: 2"))
     (after,) = read_entries([submission.path], conf)[0]
     wrong = [check.text for check in rescore(read_submission(submission.path, config_dir=conf)) if not check.passed]
-    method.write_text(method.read_text() + "track_version: 3\n")
+    edit(submission.path, lambda given: given["method"].update(track_version=3))
     (problem,) = read_entries([submission.path], conf)[1]
 
     assert (before.track.id, after.track.id) == ("tiny-v1", "tiny-v1")
@@ -133,49 +140,21 @@ def test_a_submission_to_an_earlier_version_of_a_track_is_in_a_table_of_its_own_
     assert "the newest version of the track is tiny-v2; it was submitted to tiny-v3: use a package" in problem.reason
 
 
-def test_all_files_are_written_and_describe_each_other(board):
+def test_all_files_are_written(board):
     folder = board.page.parent
 
     assert {path.name for path in folder.iterdir()} == {
         *("board.html", "board.md", "board.json", "tables.tex"),
-        *("entries.csv", "scores.csv", "croissant.json", "model-index.yaml"),
+        *("entries.csv", "scores.csv"),
     }
     assert board.problems == [] and [table.title for table in board.tables] == ["tiny-v1, given: boundaries"]
     assert len(list(csv.DictReader((folder / "scores.csv").open()))) == 2 * 2
 
 
-def test_the_metadata_is_what_croissant_asks_for(board):
-    folder = board.page.parent
-    about = json.loads((folder / "croissant.json").read_text())
-
-    assert about["@type"] == "sc:Dataset" and about["conformsTo"] == "http://mlcommons.org/croissant/1.0"
-    required = ("@context", "description", "license", "name", "url", "creator", "datePublished")
-    assert all(about[key] for key in required) and about["datePublished"] == "2026-01-02"
-    assert re.fullmatch(r"\d+\.\d+\.\d+\w*", about["version"]) and re.fullmatch(r"\w+", about["name"])
-    fields = {field["@id"]: field for records in about["recordSet"] for field in records["field"]}
-    names = [each["@id"] for part in ("distribution", "recordSet") for each in about[part]] + list(fields)
-    assert len(set(names)) == len(names) == 2 + 2 + sum(len(each["field"]) for each in about["recordSet"])
-    for file in about["distribution"]:
-        content = (folder / file["contentUrl"]).read_bytes()
-        assert file["@type"] == "cr:FileObject" and file["encodingFormat"] == "text/csv"
-        assert (file["sha256"], file["contentSize"]) == (hashlib.sha256(content).hexdigest(), f"{len(content)} B")
-        extracted = [f["source"]["extract"]["column"] for f in fields.values() if file == _file_of(f, about)]
-        assert extracted == content.decode().splitlines()[0].split(",")
-    assert {field["dataType"] for field in fields.values()} <= {"sc:Text", "sc:Integer", "sc:Float"}
-    assert all(field["@type"] == "cr:Field" and field["description"] for field in fields.values())
-    assert fields["scores/submission"]["references"]["field"]["@id"] in fields
-    assert about["recordSet"][0]["key"]["@id"] in fields
-
-
-def _file_of(field, about):
-    return next(file for file in about["distribution"] if file["@id"] == field["source"]["fileObject"]["@id"])
-
-
 def test_the_command_says_what_is_left_out_and_why(tiny_home, submission, tmp_path, monkeypatch, capsys):
     shutil.copytree(submission.path, tmp_path / "all" / "twice")
     shutil.copytree(submission.path, tmp_path / "all" / "other")
-    other = tmp_path / "all" / "other" / "method.yaml"
-    other.write_text(other.read_text().replace("track: tiny", "track: forgetting"))
+    edit(tmp_path / "all" / "other", lambda given: given["method"].update(track="forgetting"))
     (tmp_path / "empty").mkdir()
     paths = (str(submission.path), str(tmp_path / "all"), str(tmp_path / "empty"))
     words = ["board", *paths, "--out", str(tmp_path / "out"), "--config-dir", str(tiny_home / "conf")]

@@ -207,22 +207,6 @@ def test_json_and_csv_hold_the_numbers_of_each_seed(made):
     assert len(scores) == 1 + 3 * 3 * 20 and scores[0] == "submission,seed,metric,value"
 
 
-def test_a_model_hub_finds_task_data_set_and_metrics(made):
-    models = yaml.safe_load(formats.model_index(made))["model-index"]
-
-    assert [model["name"] for model in models] == ["<b>A_1</b> & *co* | $x$", "PPO", "other"]
-    (result,) = models[1]["results"]
-    assert result["task"]["type"] == "reinforcement-learning"
-    assert result["dataset"] == {
-        "type": "ctgraph_rl/small-v1",
-        "name": "ctgraph_rl small-v1, given: task ids, boundaries",
-        "config": "fo_b1_4tasks",
-        "revision": "84e7ff519e265d9b",
-    }
-    assert result["metrics"][0]["type"] == "normalised_performance" and result["metrics"][0]["value"] == 0.5
-    assert "&id" not in formats.model_index(made)
-
-
 def test_the_page_needs_no_network_and_shows_names_as_text(made):
     page = html(made)
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from helpers.submissions import edit_run
 
 from ctgraph_rl.board.rescore import rescore
 from ctgraph_rl.board.standings.entries import read_entries
@@ -18,13 +19,9 @@ from ctgraph_rl.board.submission import read_submission
 from ctgraph_rl.log.sums import SUMS
 from ctgraph_rl.runs.read import find_runs
 
-BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
-    f"{name}: &{name} [{', '.join(['*' + before] * 9)}]\n" for before, name in zip("abcdefgh", "bcdefghi", strict=True)
-)
-
 
 def sparse(folder: Path) -> None:
-    with (folder / "more").open("wb") as file:
+    with (folder / "submission.json").open("wb") as file:
         file.truncate(10 * 2**30)
 
 
@@ -39,32 +36,6 @@ def nested(folder: Path) -> None:
     os.close(where)
 
 
-def second_line(folder: Path) -> None:
-    """State a better score before the true one."""
-    path = folder / "metrics.csv"
-    lines = path.read_text().splitlines(keepends=True)
-    true = next(line for line in lines if ",average_performance," in line)
-    cells = true.split(",")
-    path.write_text("".join([lines[0], ",".join([*cells[:3], "0.99", *cells[4:]]), *lines[1:]]))
-
-
-def second_line_that_spreadsheets_read(folder: Path) -> None:
-    """State a better score of a run whose name has the mark by which spreadsheets read a text."""
-    path = folder / "metrics.csv"
-    lines = path.read_text().splitlines(keepends=True)
-    true = next(line for line in lines if ",average_performance," in line)
-    path.write_text("".join([lines[0], "'" + true, *lines[1:]]))
-
-
-def further_member(folder: Path) -> None:
-    path = next((folder / "logs").iterdir())
-    path.write_bytes(path.read_bytes() + gzip.compress(b'{"kind": "more"}\n'))
-
-
-def odd_name(folder: Path) -> None:
-    Path(os.fsdecode(os.fsencode(folder) + b"/\xff")).write_text("")
-
-
 def logged(folder: Path, kind: str = "experts", **fields: object) -> None:
     """Add a line to a log."""
     path = next((folder / "logs").iterdir())
@@ -72,47 +43,35 @@ def logged(folder: Path, kind: str = "experts", **fields: object) -> None:
     path.write_bytes(gzip.compress(gzip.decompress(path.read_bytes()) + line))
 
 
+def replaced(folder: Path, before: str, after: str) -> None:
+    path = folder / "submission.json"
+    text = path.read_text()
+    assert before in text
+    path.write_text(text.replace(before, after, 1))
+
+
 BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
-    "alias bomb": (lambda folder: (folder / "config.yaml").write_text(BOMB), "anchors (&name) are not read"),
-    "base 60": (
-        lambda folder: (folder / "method.yaml").write_text("name: " + ":".join(["59"] * 20_000)),
-        "is a number to some programs, a text to others",
+    "key twice": (
+        lambda folder: replaced(folder, '"schema": 2', '"schema": 2, "schema": 2'),
+        "key 'schema' occurs twice in one object",
     ),
-    "long file": (lambda folder: (folder / "method.yaml").write_text("a: " + "1:" * 200_000), "the limit is 65,536"),
-    "sparse file": (sparse, "has files of more than 1,073,741,824 bytes, more: remove them"),
-    "nested folders": (nested, "has folders within more than 32 others"),
-    "second line": (second_line, "are both of tiny-seed0, average_performance: leave one out"),
-    "second line behind a mark": (
-        second_line_that_spreadsheets_read,
-        "are both of tiny-seed0, average_performance: leave one out",
+    "no number of JSON": (lambda folder: replaced(folder, '"schema": 2', '"schema": NaN'), "NaN is no number of JSON"),
+    "long number": (
+        lambda folder: replaced(folder, '"schema": 2', '"schema": ' + "1" * 400),
+        "an integer has 400 digits, the limit is 40",
     ),
-    "lines that other programs do not see": (
-        lambda folder: (folder / "versions.txt").write_text(
-            (folder / "versions.txt").read_text().replace("\n", "\x0b")
-        ),
-        "must have a line # machine==KIND",
+    "nested": (
+        lambda folder: (folder / "submission.json").write_text("[" * 10**5),
+        "submission.json nested more than 32 deep",
     ),
-    "further member": (further_member, "has more after its end"),
-    "name that is not UTF-8": (odd_name, r"has names that are not UTF-8"),
+    "sparse file": (sparse, "has 10,737,418,240 bytes, the limit is 16,777,216"),
     "digits that are not ASCII": (
-        lambda folder: (folder / "runs.csv").write_text(
-            (folder / "runs.csv").read_text().replace("tiny-seed1,1,", "tiny-seed1,\u0661,", 1)
-        ),
-        "seed must be an integer >= 0",
+        lambda folder: edit_run(folder, seed="\u0661"),
+        "must be an integer >= 0",
     ),
     "experts: 5": (lambda folder: logged(folder, experts=5), "experts must be a list of objects with a task"),
     "together: 5": (lambda folder: logged(folder, together=5), "together must be a list of seeds"),
     "versions: 5": (lambda folder: logged(folder, versions=5), "versions must be an object of texts"),
-    "long label": (
-        lambda folder: logged(
-            folder, "evaluation", block=0, frames=0, task=1, return_mean=0.0, moment="before", label="x" * 2**17
-        ),
-        "logs a text in label has 131,072 bytes, the limit is 65,536",
-    ),
-    "versions twice": (
-        lambda folder: (folder / "versions.txt").write_text((folder / "versions.txt").read_text() + "torch==1\n"),
-        "versions.txt has a name twice",
-    ),
 }
 
 
@@ -140,11 +99,7 @@ def test_a_broken_submission_is_refused_in_one_line(tiny_submission, copy, name)
 
 @pytest.mark.parametrize(
     "name",
-    [
-        "second line",
-        "nested folders",
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("alias bomb", "name that is not UTF-8")),
-    ],
+    ["key twice", "nested", "sparse file"],
 )
 def test_a_broken_submission_is_no_end_for_others(tiny_submission, tiny_home, copy, name):
     shutil.copytree(tiny_submission.path, copy.parent / "whole")
@@ -155,20 +110,6 @@ def test_a_broken_submission_is_no_end_for_others(tiny_submission, tiny_home, co
     assert [entry.folder for entry in entries] == [copy.parent / "whole"]
     assert {"broken" in str(problem.path) for problem in problems} == {True}
     assert all("\n" not in problem.reason for problem in problems)
-
-
-def test_a_table_that_unpacks_to_much_is_a_difference(submission):
-    pyarrow = pytest.importorskip("pyarrow")
-    from pyarrow import parquet
-
-    path = submission.path / "evaluations.parquet"
-    rows = parquet.read_table(path)
-    many = pyarrow.table({name: rows.column(name).take([0] * 30_000) for name in rows.column_names})
-    parquet.write_table(many, path)
-
-    (check,) = [each for each in rescore(submission) if each.what == "evaluations.parquet"]
-
-    assert (check.passed, check.note[:11]) == (False, "it has 30,0")
 
 
 @pytest.mark.parametrize(

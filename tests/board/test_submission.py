@@ -2,104 +2,154 @@
 
 from __future__ import annotations
 
-import shutil
+import gzip
+import json
+import subprocess
+import sys
 import zlib
 
 import pytest
 from helpers.paths import CHECKOUT
+from helpers.submissions import edit, edit_run
 
 from ctgraph_rl.board.method_yaml import EXAMPLE
-from ctgraph_rl.board.submission import COLUMNS, FILES, METRIC_COLUMNS, VERIFICATION, read_submission
-
-pytest.importorskip("pyarrow")
+from ctgraph_rl.board.submission import PARTS, RUN, SUBMISSION, VERIFICATION, read_submission
 
 
-def test_the_page_of_the_format_lists_every_file_column_and_key():
+def test_the_page_of_the_format_lists_every_file_and_key():
     page = (CHECKOUT / "docs" / "reference" / "submissions.md").read_text(encoding="utf-8")
     keys = [f"{key}.{part}" for key, value in EXAMPLE.items() for part in value or [""] if isinstance(value, dict)]
     plain = [key for key, value in EXAMPLE.items() if not isinstance(value, dict) or not value]
 
-    for columns in (COLUMNS, METRIC_COLUMNS):
-        assert "\n".join(f"| `{name}` | {meaning} |" for name, meaning in columns.items()) in page
-    for name in (*FILES, VERIFICATION, *plain, *(key.removesuffix(".") for key in keys)):
+    for meanings in (PARTS, RUN):
+        assert "\n".join(f"| `{name}` | {meaning} |" for name, meaning in meanings.items()) in page
+    for name in (SUBMISSION, VERIFICATION, *plain, *(key.removesuffix(".") for key in keys)):
         assert f"`{name}`" in page
 
 
-def test_the_digest_is_of_all_files_but_verifications_and_hidden_ones(submission):
-    before = submission.digest
-
+def test_the_digest_is_that_of_the_file_that_has_the_sums_of_all_logs(submission):
     (submission.path / "verification.json").write_text("{}")
-    (submission.path / ".DS_Store").write_text("")
-    assert read_submission(submission.path, submission.track).digest == before
-
     (submission.path / "logs" / "code.py").write_text("")
-    assert read_submission(submission.path, submission.track).digest != before
+    assert read_submission(submission.path, submission.track).digest == submission.digest
+
+    edit_run(submission.path, log_sha256="0" * 64)
+    assert read_submission(submission.path, submission.track).digest != submission.digest
 
 
 @pytest.mark.parametrize(
-    ("file", "content", "message"),
+    ("change", "message"),
     [
-        ("method.yaml", "name: [", r"method.yaml must be YAML: .* expected the node content"),
-        (
-            "method.yaml",
-            "- 1",
-            r"method.yaml: it must hold name, authors and so on, got \[1\]; ctgraph-rl submit",
-        ),
-        ("method.yaml", "nam: x", "name is missing; .*unknown key nam: did you mean 'name'"),
-        ("config.yaml", "seed: 1", "config.yaml must leave out the seed, which runs.csv lists"),
-        ("versions.txt", "torch", r"versions.txt must have lines such as torch==2.9.0, got \['torch'\]"),
-        ("runs.csv", "run,seed\n", "runs.csv must have the columns run, seed, curriculum, .*, got run, seed"),
-        ("metrics.csv", None, r"submission lacks metrics.csv: ctgraph-rl submit RUNS --to DIR writes all of them"),
-        ("logs/tiny-seed0.jsonl.gz", None, "lacks logs/tiny-seed0.jsonl.gz, which runs.csv names"),
+        (lambda given: given.pop("method"), "must be an object of schema, method, config, versions, curriculum, runs"),
+        (lambda given: given.update(more=1), "must be an object of schema, method"),
+        (lambda given: given.update(schema=3), "has schema 3, this reads 2"),
+        (lambda given: given["method"].pop("name"), "name is missing"),
+        (lambda given: given["method"].update(nam="x"), "unknown key nam: did you mean 'name'"),
+        (lambda given: given["config"].update(seed=1), "config must leave out the seed, which the runs have"),
+        (lambda given: given.update(config=[1]), r"config must be settings, got \[1\]"),
+        (lambda given: given.update(versions={"torch": 2}), "versions must be texts by name, got"),
+        (lambda given: given.update(runs=[]), r"runs must be a list of 1..10,000, got \[\]"),
+        (lambda given: given["curriculum"].pop("blocks"), "blocks"),
     ],
 )
-def test_what_is_no_submission_is_refused_with_the_file(submission, file, content, message):
-    path = submission.path / file
-    path.unlink()
-    if content is not None:
-        path.write_text(content)
+def test_what_is_no_submission_is_refused_with_the_file_and_the_key(submission, change, message):
+    edit(submission.path, change)
 
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=f"submission.json .*{message}"):
         read_submission(submission.path, submission.track)
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "message"),
+    ("values", "message"),
     [
-        ("tiny-seed1,", "../tiny-seed1,", r"line 3: run must be a name of a file, got '../tiny-seed1'"),
-        ("tiny-seed1,1,", "tiny-seed1,0,", "runs.csv has a seed twice: 0"),
-        ("tiny-seed1,1,", "tiny-seed0,1,", "runs.csv lines 2 and 3 are both of tiny-seed0"),
-        ("tiny-seed1,1,", "tiny-seed1,x,", "line 3: seed must be an integer >= 0, got 'x'"),
-        (",{seconds}", "," + 400 * "9", r"line 2: seconds must be a number in 0..1,000,000,000, got '9999"),
-        (",{seconds}", ",1000000000.1", r"line 2: seconds must be a number in 0..1,000,000,000, got '1000000000.1'"),
-        ("finished,", "done,", "line 2: state must be finished or failed, got 'done'"),
-        ("agent_sha256", "sha256", "runs.csv must have the columns run, seed"),
+        ({"run": "../tiny-seed1"}, r"run must name a file, got '../tiny-seed1'"),
+        ({"run": "tiny-seed0"}, "names a run twice: tiny-seed0"),
+        ({"seed": 0}, "has a seed twice: 0"),
+        ({"seed": "1"}, "seed of 'tiny-seed1' must be an integer >= 0, got '1'"),
+        ({"seed": True}, "seed of 'tiny-seed1' must be an integer >= 0, got True"),
+        ({"seconds": 1e9 + 0.1}, r"seconds of 'tiny-seed1' must be a number in 0..1,000,000,000, got 1000000000.1"),
+        ({"reason": 5}, "reason of 'tiny-seed1' must be a text or null, got 5"),
+        ({"group": [0, "x"]}, "group of 'tiny-seed1' must be a list of seeds"),
+        ({"log_sha256": "x"}, "log_sha256 of 'tiny-seed1' must be 64 hexadecimal digits"),
+        ({"agent_sha256": ""}, "agent_sha256 of 'tiny-seed1' must be 64 hexadecimal digits or null"),
+        ({"agent_bytes": -1}, "agent_bytes of 'tiny-seed1' must be an integer >= 0 or null, got -1"),
+        ({"experts": ["x"]}, "experts of 'tiny-seed1' must be sums"),
+        ({"more": 1}, "a run must have run, seed, reason"),
     ],
 )
-def test_a_line_of_runs_csv_out_of_range_is_refused(submission, before, after, message):
-    path = submission.path / "runs.csv"
-    path.write_text(path.read_text().replace(before.format(seconds=submission.runs[0].seconds), after, 1))
+def test_a_run_out_of_range_is_refused(submission, values, message):
+    edit_run(submission.path, 1, **values)
 
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=f"submission.json .*{message}"):
         read_submission(submission.path, submission.track)
 
 
-def test_links_are_refused_and_no_log_is_unpacked_beyond_its_limit(submission, monkeypatch):
-    run, log = submission.runs[0], submission.path / "logs" / "tiny-seed0.jsonl.gz"
+def test_without_a_file_it_names_the_file_is_named(submission):
+    (submission.path / "logs" / "tiny-seed0.jsonl.gz").unlink()
+    with pytest.raises(ValueError, match=r"lacks logs/tiny-seed0.jsonl.gz, which submission.json names"):
+        read_submission(submission.path, submission.track)
 
-    monkeypatch.setattr("ctgraph_rl.board.submission.MOST_BYTES", 1000)
-    with pytest.raises(ValueError, match=r"tiny-seed0.jsonl.gz (has|holds more than) .*1,000"):
-        submission.log(run)
-    monkeypatch.undo()
+    (submission.path / SUBMISSION).unlink()
+    with pytest.raises(ValueError, match=r"holds no submission, it lacks submission.json: ctgraph-rl submit RUNS --to"):
+        read_submission(submission.path, submission.track)
+
+
+def test_no_log_is_unpacked_beyond_its_limit_and_a_torn_one_is_refused(submission, monkeypatch):
+    run = submission.runs[0]
+    log = submission.path / "logs" / "tiny-seed0.jsonl.gz"
+
+    with monkeypatch.context() as small:
+        small.setattr("ctgraph_rl.board.submission.MOST_BYTES_OF_A_LOG", 1000)
+        with pytest.raises(ValueError, match=r"tiny-seed0.jsonl.gz (has|holds more than) .*1,000"):
+            submission.log(run)
     whole = log.read_bytes()
-    log.write_bytes(whole[:-20])
-    with pytest.raises(ValueError, match="ends too early: restore it"):
-        submission.log(run)
-    log.write_bytes(zlib.compress(b"no gzip"))
-    with pytest.raises(ValueError, match="is no file of gzip"):
-        submission.log(run)
-
-    shutil.move(log, submission.path / "elsewhere")
-    log.symlink_to(submission.path / "elsewhere")
-    with pytest.raises(ValueError, match=r"has links, logs/tiny-seed0.jsonl.gz: put the files in their place"):
+    for content in (whole[:-20], zlib.compress(b"no gzip"), whole + b"more"):
+        log.write_bytes(content)
+        with pytest.raises(ValueError, match=r"is no file of gzip: .*; restore it"):
+            submission.log(run)
+    log.unlink()
+    log.symlink_to(submission.path / "verification.json")
+    with pytest.raises(ValueError, match="lacks logs/tiny-seed0"):
         read_submission(submission.path, submission.track)
+
+
+BOMBS = {
+    "grows": bytes(2**28),
+    "small records": b"{}\n" * (2**26 // 3),
+    "small values": b'{"kind": "training", "a": [' + b"{}," * (2**26 // 3 - 20) + b"{}]}\n",
+}
+
+READ = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[2]), int(sys.argv[2])))
+from pathlib import Path
+from ctgraph_rl.board.submission import read_log
+try:
+    read_log(Path(sys.argv[1]))
+except ValueError as error:
+    print(error)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", BOMBS)
+def test_a_bomb_is_refused_before_it_takes_more_than_its_limit(tmp_path, name):
+    path = tmp_path / "log.jsonl.gz"
+    path.write_bytes(gzip.compress(BOMBS[name], 1))
+    done = subprocess.run([sys.executable, "-c", READ, str(path), str(2**34)], capture_output=True, text=True)
+
+    assert done.returncode == 0, done.stderr
+    said, kibibytes = done.stdout.splitlines()
+    assert "holds more than 67,108,864 bytes" in said or "of memory, the limit is 4,294,967,296" in said
+    assert int(kibibytes) * 1024 < 10**9
+
+
+def test_small_records_count_by_the_memory_that_they_take(monkeypatch):
+    from ctgraph_rl.log import run_log
+
+    monkeypatch.setattr(run_log, "MOST_MEMORY", 10_000)
+    line = json.dumps({"kind": "training", "block": 1, "frames": 64}).encode() + b"\n"
+
+    assert len(run_log.RunLog.of_content(line * 10, "run.jsonl").measurements) == 10
+    with pytest.raises(ValueError, match=r"run.jsonl would take [\d,]+ bytes of memory, the limit is 10,000"):
+        run_log.RunLog.of_content(line * 20, "run.jsonl")

@@ -19,14 +19,13 @@ from helpers.sweeping import command_line
 from ctgraph_rl import Recorder, RunLog
 from ctgraph_rl.board import submit as module
 from ctgraph_rl.board.method_yaml import fact_rules, read_method
+from ctgraph_rl.board.rescore import scores_of
 from ctgraph_rl.board.submission import log_sum, read_submission
 from ctgraph_rl.board.submission_rules import oracle_rule
 from ctgraph_rl.board.submit import submit
 from ctgraph_rl.log.files import locked_new
 from ctgraph_rl.log.saved import sum_of_state
 from ctgraph_rl.runs.config import plain
-
-pytest.importorskip("pyarrow")
 
 
 @pytest.fixture
@@ -48,15 +47,14 @@ def test_a_submission_has_a_line_for_each_seed_and_what_the_logs_give(tiny_submi
     made, run_dir = tiny_submission, tiny_home / "runs" / "tiny-seed1"
     second, log = made.runs[1], RunLog.read(run_dir / "run.jsonl")
 
-    assert (second.run, second.seed, second.state, second.group) == ("tiny-seed1", 1, "finished", ())
-    assert (second.fingerprint, made.curriculum) == (tiny_track.curriculum.fingerprint, tiny_track.curriculum)
+    assert (second.run, second.seed, second.finished, second.group) == ("tiny-seed1", 1, True, ())
+    assert made.curriculum == tiny_track.curriculum
     assert second.log_sha256 == log_sum(log) == log_sum(made.log(second))
     assert second.agent_sha256 == sum_of_state(torch.load(run_dir / "agent.pt", weights_only=True))
     assert {"seed": 1, **made.config} == log.measurements[0]["config"]
     assert made.versions == log.measurements[0]["versions"]
     metrics = json.loads((run_dir / "metrics.json").read_text())
-    values = {name: cells["value"] for name, cells in made.metrics["tiny-seed1"].items()}
-    assert values == {name: "" if m["value"] is None else repr(m["value"]) for name, m in metrics.items()}
+    assert scores_of(made, second) == {name: metrics[name]["value"] for name in ("average_performance", "forgetting")}
     assert (made.method["track"], made.method["given"]["task_id"]) == ("tiny", "hidden")
     assert made.method["compute"]["hours"] == round(sum(run.seconds for run in made.runs) / 3600, 4)
 
@@ -261,11 +259,8 @@ def test_a_failed_run_that_is_accounted_for_is_a_line_with_its_reason(runs, tiny
 
     made = submit([runs], runs.parent / "made", {**method, "failed": {1: "the loss was nan"}}, tiny_track)
 
-    assert [(run.state, run.reason, run.agent_sha256 == "") for run in made.runs] == [
-        ("finished", "", False),
-        ("failed", "the loss was nan", True),
-    ]
-    assert set(made.metrics) == {"tiny-seed0"}
+    assert [(run.reason, run.agent_sha256 is None) for run in made.runs] == [(None, False), ("the loss was nan", True)]
+    assert made.method["failed"] == {1: "the loss was nan"} and [run.run for run in made.finished] == ["tiny-seed0"]
 
 
 def test_what_fails_while_it_is_written_leaves_nothing_and_what_is_there_is_never_replaced(
@@ -279,20 +274,13 @@ def test_what_fails_while_it_is_written_leaves_nothing_and_what_is_there_is_neve
     with locked_new(made), pytest.raises(BlockingIOError, match=f"made is in use by process {os.getpid()} on"):
         submit([runs], made, method, tiny_track)
 
-    def full(logs: object) -> bytes:
+    def full(*parts: object) -> str:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(module, "evaluations_parquet", full)
+    monkeypatch.setattr(module, "submission_text", full)
     with pytest.raises(OSError, match="No space left"):
         submit([runs], made, method, tiny_track)
     assert [path.name for path in runs.parent.iterdir()] == ["runs"]
-
-
-def test_without_pyarrow_the_error_names_the_extra(runs, tiny_track, method, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-
-    with pytest.raises(ModuleNotFoundError, match=r"pip install 'ctgraph_rl\[tables\]'"):
-        submit([runs], runs.parent / "made", method, tiny_track)
 
 
 def learn(curriculum, seed, run_dir):
@@ -318,7 +306,7 @@ def test_a_learner_of_others_is_submitted_with_the_entry_point_that_runs_it_agai
         submit([tmp_path / "runs"], tmp_path / "made", method, tiny_track)
     made = submit([tmp_path / "runs"], tmp_path / "made", {**method, "entry_point": "test_submit:learn"}, tiny_track)
 
-    assert [(run.run, run.agent_sha256, run.agent_bytes) for run in made.runs] == [("0", "", None), ("1", "", None)]
+    assert [(run.run, run.agent_sha256, run.agent_bytes) for run in made.runs] == [("0", None, None), ("1", None, None)]
     assert made.config == {"learner": "a table"}
     learn(made.curriculum, 1, tmp_path / "again")
     assert log_sum(RunLog.read(tmp_path / "again" / "run.jsonl")) == made.runs[1].log_sha256
@@ -363,10 +351,11 @@ def test_the_logs_of_experts_are_submitted_and_their_metrics_are_those_of_the_ru
 
     (run,) = made.runs
     stored = json.loads(Path("runs/one/metrics.json").read_text())
-    assert [log.of_kind("run")[0]["curriculum"] for log in made.experts(run)] == ["single-task expert"] * 4
-    reasons = {name: cells["undefined"] for name, cells in made.metrics["one"].items()}
-    assert reasons == {name: metric["undefined"] or "" for name, metric in stored.items()}
-    assert "no experts were given" not in reasons.values()
+    assert [log.of_kind("run")[0]["curriculum"] for log in made.experts(run, made.log(run))] == [
+        "single-task expert"
+    ] * 4
+    assert len(run.experts) == 4
+    assert scores_of(made, run)["average_performance"] == stored["average_performance"]["value"]
     shutil.rmtree("runs/experts")
     with pytest.raises(ValueError, match=r"was trained with experts, runs/experts/.* cannot be found: submit from the"):
         submit([Path("runs")], Path("again"), method, one)

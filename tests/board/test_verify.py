@@ -12,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from helpers.submissions import edit_run
 from helpers.sweeping import command_line
 
 from ctgraph_rl.board import bubblewrap, relearn, rerun, verify
@@ -105,11 +106,8 @@ def test_an_edited_sum_of_an_agent_is_found_by_a_rerun_alone(
     tiny_home, tiny_track, method, tmp_path, monkeypatch, in_process
 ):
     folder = submitted(tiny_home, tiny_track, method, tmp_path / "submission")
-    lines = (folder / "runs.csv").read_text().splitlines(keepends=True)
-    for line in lines[1:]:
-        agent_sha256, agent_bytes = line.split(",")[7:9]
-        lines = [each.replace(f"{agent_sha256},{agent_bytes}", f"{'a' * 64},1") for each in lines]
-    (folder / "runs.csv").write_text("".join(lines))
+    for number in (0, 1):
+        edit_run(folder, number, agent_sha256="a" * 64, agent_bytes=1)
 
     code, written = call(monkeypatch, tiny_home, folder, "--cells=1", "--yes")
 
@@ -171,7 +169,7 @@ def test_a_verification_that_is_stopped_says_how_to_go_on_and_ends_with_the_code
     assert signal.getsignal(signal.SIGTERM) == before
 
 
-def test_nothing_of_others_runs_without_bubblewrap_unless_the_user_says_so(
+def test_nothing_of_others_runs_without_bubblewrap_and_rescored_runs_nothing(
     tiny_submission, tiny_home, tmp_path, monkeypatch, in_process, capsys
 ):
     folder = shutil.copytree(tiny_submission.path, tmp_path / "submission")
@@ -179,15 +177,13 @@ def test_nothing_of_others_runs_without_bubblewrap_unless_the_user_says_so(
     opened = Isolation(bubblewrap=None, why_not=why, graphics=False, is_root=False)
     monkeypatch.setattr(verify, "isolation", lambda folder, graphics: opened)
 
-    code, _ = call(monkeypatch, tiny_home, folder, "--number=3", "--yes")
+    for level in ("rerun", "held_out"):
+        code, _ = call(monkeypatch, tiny_home, folder, "--number=3", "--yes", f"--level={level}")
 
-    assert (code, in_process) == (2, [])
-    assert f"the code of others is not run: {why}, or give --not-isolated" in capsys.readouterr().err
-    code, written = call(monkeypatch, tiny_home, folder, "--number=3", "--yes", "--not-isolated")
-    assert (code, written["level"], written["isolation"]["bubblewrap"]) == (0, "rerun", None)
-    said = capsys.readouterr().out
-    assert f"isolated: nothing, {why}" in said
-    assert "NOT isolated: it can do all that you can" in said
+        assert (code, in_process) == (2, [])
+        assert f"the code of others is not run: {why}; --level rescored runs none" in capsys.readouterr().err
+    code, written = call(monkeypatch, tiny_home, folder, "--level=rescored")
+    assert (code, written["level"], in_process) == (0, "rescored", [])
 
 
 def test_seeds_that_were_trained_together_are_drawn_as_their_group(tiny_submission, tmp_path):
@@ -226,7 +222,7 @@ def test_where_bits_are_not_promised_scores_are_tested_and_the_power_is_stated(
     run = tiny_submission.runs[0]
     other = rerun.Rerun(RunLog(), "", None, run.agent_bytes)
     results = {replace(run, seed=seed): other for seed in range(1, len(found) + 1)}
-    stopped = rerun.Rerun(None, "", "stopped: it took longer than 1 seconds")
+    stopped = rerun.Rerun(None, None, "stopped: it took longer than 1 seconds")
 
     check, *sizes, undecided = rerun.verified(tiny_submission, {**results, run: stopped}, ["cpu A there, B here"])
 
@@ -253,16 +249,17 @@ def test_bits_are_promised_on_one_machine_and_versions_and_named_where_they_are_
 def test_a_learner_that_is_not_ours_is_called_by_its_entry_point(tiny_submission, tmp_path, monkeypatch):
     (tmp_path / "waiting_learner.py").write_text(ENTRY)
     monkeypatch.syspath_prepend(tmp_path)
+    tiny_submission.curriculum.to_json(tmp_path / "curriculum.json")
     sums = []
     for name in ("one", "two"):
         folder = tmp_path / name
         folder.mkdir()
-        path = str(tiny_submission.path / "curriculum.json")
+        path = str(tmp_path / "curriculum.json")
         job = Relearning((3,), False, {}, 1, entry_point="waiting_learner:train", curriculum=path)
         relearn.learn_again(job, folder)
         cell = rerun.RerunCell(folder, job, (), tiny_submission.curriculum, 1.0)
         result = result_of(cell, 3, Outcome(0, None, 0.0, ""))
-        assert (result.failure, result.agent_sha256) == (None, "")
+        assert (result.failure, result.agent_sha256) == (None, None)
         sums.append(rerun.log_sum(result.log))
 
     assert sums[0] == sums[1]
@@ -280,17 +277,16 @@ def test_a_link_in_place_of_a_result_is_a_failure(tiny_home, tiny_submission, tm
 
 
 @pytest.mark.slow
+@pytest.mark.skipif((bubblewrap.version() or (0, 0)) < bubblewrap.OLDEST, reason="needs bubblewrap")
 def test_a_group_is_rerun_in_a_process_of_its_own(tiny_home, tiny_track, method, tmp_path, monkeypatch):
     settings = [f"agent.{name}" for name in ("num_envs=8", "num_steps=4", "hidden_size=4", "num_minibatches=1")]
     where = [f"--config-dir={tiny_home / 'conf'}", f"hydra.sweep.dir={tmp_path / 'runs'}"]
     assert command_line(monkeypatch, "-m", *where, "track=tiny", "agent=ppo", *settings, "together=true") == 0
     folder = submitted(tmp_path, tiny_track, method, tmp_path / "submission")
 
-    code, written = call(monkeypatch, tiny_home, folder, "--cells=1", "--yes", "--not-isolated")
+    code, written = call(monkeypatch, tiny_home, folder, "--cells=1", "--yes")
 
     assert (code, written["level"], len(written["cells"])) == (0, "rerun", 2)
-    has_bubblewrap = (bubblewrap.version() or (0, 0)) >= bubblewrap.OLDEST
-    assert (written["isolation"]["bubblewrap"] is not None) == has_bubblewrap
 
 
 @pytest.mark.slow
@@ -308,7 +304,9 @@ def test_runs_of_other_numbers_and_of_more_threads_than_cores_are_refused(tiny_s
     with pytest.raises(ValueError, match=r"had 4096 threads, this machine has .* cores: verify it on a larger one"):
         cells_of(replace(tiny_submission, runs=runs), runs, tmp_path)
     monkeypatch.setattr("ctgraph_rl.log.provenance.NUMBERS", 2)
-    with pytest.raises(ValueError, match="numbers version 1, this ctgraph_rl has 2: install the versions of versions"):
+    with pytest.raises(
+        ValueError, match="numbers version 1, this ctgraph_rl has 2: install the versions that submission"
+    ):
         rerun.why_other_bits(tiny_submission, tiny_submission.runs)
 
 
@@ -333,7 +331,7 @@ def test_a_level_needs_all_checks_and_a_lower_held_out_score_takes_none_away():
 
 def test_a_run_that_cannot_be_finished_here_is_undecided_and_says_why(tiny_submission):
     run = tiny_submission.runs[0]
-    stopped = rerun.Rerun(None, "", "stopped: it took longer than 1 seconds")
+    stopped = rerun.Rerun(None, None, "stopped: it took longer than 1 seconds")
 
     (check,) = rerun.checks_of(run, tiny_submission.log(run), stopped)
 
@@ -341,7 +339,7 @@ def test_a_run_that_cannot_be_finished_here_is_undecided_and_says_why(tiny_submi
     assert "undecided: tiny-seed0: rerun: expected it finishes, found stopped" in verify.report(
         tiny_submission, [check]
     )
-    failed_there = replace(run, state="failed", reason="the loss was nan")
+    failed_there = replace(run, reason="the loss was nan")
     assert rerun.checks_of(failed_there, RunLog(), stopped)[0].passed is None
     assert rerun.checks_of(failed_there, RunLog(), stopped._replace(failed_alone=True))[0].passed is True
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import json
 import math
 import random
@@ -22,30 +21,13 @@ VALID: dict[str, bytes] = {
     "json": json.dumps({"a": [1, -2.5e-3, None, True, "x\u00e9"], "b": {"c": {}}}, indent=2).encode(),
     "lines": LINE + b'{"kind": "training", "block": 1, "frames": 64, "return_mean": 0.5}\n' * 2,
     "yaml": yaml.safe_dump({"name": "x", "seeds": [1, 2], "hours": 0.5, "none": None, "part": {"yes": True}}).encode(),
-    "csv": b'run,metric,value\na,one,1\na,two,"x,""y"""\n',
-    "gzip": gzip.compress(LINE * 20, mtime=0),
 }
 
 READERS: dict[str, Callable[[bytes], Any]] = {
     "json": strict.json_value,
     "lines": lambda content: RunLog.of_content(content, "run.jsonl").measurements,
     "yaml": strict.yaml_value,
-    "csv": lambda content: strict.csv_rows(content, ["run", "metric", "value"], ["run", "metric"], 3),
-    "gzip": lambda content: strict.unpacked(content, 10**5),
-    "parquet": lambda content: strict.parquet_rows(content, table()),
 }
-
-
-def table(rows: int = 3, **columns: Any) -> bytes:
-    """Return a Parquet file with a text and a number in each row."""
-    pyarrow = pytest.importorskip("pyarrow")
-    from pyarrow import BufferOutputStream, parquet
-
-    options = columns.pop("options", {})
-    made = BufferOutputStream()
-    whole = {"label": [f"goal {row}" for row in range(rows)], "frames": [64 * row for row in range(rows)], **columns}
-    parquet.write_table(pyarrow.table(whole), made, **options)
-    return made.getvalue().to_pybytes()
 
 
 @pytest.mark.parametrize("name", VALID)
@@ -57,8 +39,6 @@ def test_what_is_whole_is_read(name):
         assert read == json.loads(VALID[name])
     if name == "yaml":
         assert read == yaml.safe_load(VALID[name])
-    if name == "gzip":
-        assert read == LINE * 20
 
 
 @pytest.mark.parametrize(
@@ -89,18 +69,6 @@ def test_what_is_whole_is_read(name):
         ("yaml", b"[" * 200, "nested more than 32 deep"),
         ("yaml", b"a: \xff", "can't decode"),
         ("yaml", b"? [1]\n: 2", "a key must be a text or a number"),
-        ("csv", b"run,metric,value\na,one,0.99\na,one,0.1\n", "lines 2 and 3 are both of a, one: leave one out"),
-        ("csv", b"run,metric,value\n" + b"a,one,1\n" * 4, "has more than 3 rows, the limit"),
-        ("csv", b"run,metric,value\ra,one,1\r", "must end lines with a line feed"),
-        ("csv", b"run,value,metric\n", "must have the columns run, metric, value, got run, value, metric"),
-        ("csv", b"run,metric,value\na,one\n", "must have 3 cells in every line, line 2 has others"),
-        ("csv", b'run,metric,value\na,"one', "must be CSV"),
-        ("csv", b"run,metric,value\na,\xff,1\n", "can't decode"),
-        ("gzip", VALID["gzip"] + gzip.compress(b"more"), "has more after its end"),
-        ("gzip", VALID["gzip"] + b"\0", "has more after its end"),
-        ("gzip", VALID["gzip"][:-1], "ends too early"),
-        ("gzip", gzip.compress(bytes(10**6)), "holds more than 100,000 bytes"),
-        ("gzip", b"x" * 20, "is no file of gzip"),
     ],
 )
 def test_what_has_two_meanings_or_takes_too_much_is_refused(name, content, message):
@@ -111,45 +79,10 @@ def test_what_has_two_meanings_or_takes_too_much_is_refused(name, content, messa
     assert "\n" not in str(refused.value)
 
 
-def test_a_file_of_gzip_holds_no_more_than_its_size_lets_expect(monkeypatch):
-    content = gzip.compress(bytes(10**5), mtime=0)
-    assert strict.unpacked(content, 10**6) == bytes(10**5)
-    monkeypatch.setattr(strict, "LEAST_UNPACKED", 1000)
-
-    with pytest.raises(ValueError, match=f"holds more than {1000 + 50 * len(content):,} bytes, the limit"):
-        strict.unpacked(content, 10**6)
-
-
 def test_a_last_line_without_an_end_is_what_a_killed_run_leaves():
     log = RunLog.of_content(LINE + b'{"kind": "trai', "run.jsonl")
 
     assert (len(log.measurements), log.torn_lines) == (1, 1)
-
-
-@pytest.mark.parametrize(
-    ("columns", "message"),
-    [
-        ({"rows": 4}, "it has 4 rows, the logs give 3"),
-        ({"frames": [0.0, 1.0, 2.0]}, "it has the columns label BYTE_ARRAY, frames DOUBLE"),
-        ({"frames": [[1] * 1000] * 3}, "it has the columns"),
-        ({"more": [1, 2, 3]}, "it has the columns"),
-        ({"options": {"compression": "gzip"}}, "its compression must be one of SNAPPY, UNCOMPRESSED"),
-        ({"label": ["x" * 2**17] * 3}, "a text in label has 131,072 bytes, the limit is 65,536"),
-        ({"label": [random.Random(0).randbytes(2**20).hex()] * 3}, "1,048,960 are enough for its rows"),
-    ],
-)
-def test_a_table_of_another_form_is_refused_before_it_is_unpacked(columns, message):
-    with pytest.raises(ValueError) as refused:
-        READERS["parquet"](table(**columns))
-
-    assert message in str(refused.value)
-
-
-@pytest.mark.parametrize("rows", [0, 3, 5000])
-def test_a_table_of_the_right_form_is_read(rows):
-    content = table(rows)
-
-    assert strict.parquet_rows(content, content) == [{"label": f"goal {i}", "frames": 64 * i} for i in range(rows)]
 
 
 @pytest.mark.parametrize(
@@ -230,7 +163,7 @@ def mangled(content: bytes, rng: random.Random) -> bytes:
 
 def check_fuzzed(name: str, cases: range) -> None:
     """Read mangled contents: each is refused in one line, or read as something plain."""
-    content = VALID[name] if name != "parquet" else table()
+    content = VALID[name]
     refused = 0
     for case in cases:
         try:
@@ -249,11 +182,6 @@ def is_plain(value: Any) -> bool:
     if isinstance(value, list):
         return all(map(is_plain, value))
     return value is None or isinstance(value, str | bool | int) or not math.isnan(value)
-
-
-def test_a_parquet_file_of_an_unknown_compression_is_refused_and_does_not_end_the_process():
-    with pytest.raises(ValueError, match="its compression is unknown"):
-        READERS["parquet"](mangled(table(), random.Random(1111)))
 
 
 @pytest.mark.parametrize("name", READERS)

@@ -1,18 +1,15 @@
-"""Tables of the board for readers and programs: Markdown, LaTeX, CSV, JSON, and the results file of model hubs."""
+"""Tables of the board for readers and programs: Markdown, LaTeX, CSV and JSON."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import yaml
-
 from ctgraph_rl import __version__
-from ctgraph_rl.board.method_yaml import OURS
 from ctgraph_rl.board.standings.board_tables import BoardTable, Standing, is_significant
 from ctgraph_rl.board.standings.entries import LEVELS, shown_level
 from ctgraph_rl.board.standings.track_ceilings import in_words
-from ctgraph_rl.checks import NamedValues, ReadOnlyValues
+from ctgraph_rl.checks import NamedValues
 from ctgraph_rl.log.escape import csv_text, markdown_table, markdown_text
 from ctgraph_rl.metrics import METRICS
 from ctgraph_rl.report.formats import MEANS, measure_name
@@ -22,12 +19,6 @@ from ctgraph_rl.report.statistics import Estimate
 
 SCHEMA = 1
 """Of ``board.json``."""
-
-PAPER = "https://arxiv.org/abs/2302.10887"
-"""Source of methods that are part of this package."""
-
-TASK = {"type": "reinforcement-learning", "name": "Lifelong reinforcement learning"}
-"""What a model hub calls the task."""
 
 LEGEND = (
     f"{MEANS}; rank: those that comparisons of all pairs leave open, seed by seed, with Holm's correction at 5 %; "
@@ -144,35 +135,35 @@ def tables_tex(tables: Sequence[BoardTable]) -> str:
 
 
 ENTRY_COLUMNS = {
-    "submission": ("sc:Text", "first digits of the submission's digest"),
-    "method": ("sc:Text", "name of the method"),
-    "track": ("sc:Text", "track with its version"),
-    "rung": ("sc:Text", "rung of a ladder; empty for a track of one curriculum"),
-    "given": ("sc:Text", "what the learner was given to know of tasks"),
-    "fingerprint": ("sc:Text", "what the curriculum is, in 16 digits"),
-    "steps": ("sc:Integer", "frames that each seed learned from"),
-    "best_rank": ("sc:Integer", "best rank that the comparisons leave open; empty without a rank"),
-    "worst_rank": ("sc:Integer", "worst rank that the comparisons leave open"),
-    "score": ("sc:Text", "name of the metric that orders the table"),
-    "value": ("sc:Float", "its mean over seeds"),
-    "low": ("sc:Float", "lower end of the 95 % interval"),
-    "high": ("sc:Float", "upper end of the 95 % interval"),
-    "seeds": ("sc:Integer", "seeds with a value"),
-    "seeds_without": ("sc:Integer", "seeds without a value"),
-    "bytes_per_task": ("sc:Integer", "bytes kept for each further task, as the authors say"),
-    "agent_bytes": ("sc:Integer", "bytes of the largest agent"),
-    "hours": ("sc:Float", "hours of computing of all its runs"),
-    "level": ("sc:Text", f"how far it was verified: {', '.join(map(shown_level, LEVELS))}; scores: not by bits"),
+    "submission": "first digits of the submission's digest",
+    "method": "name of the method",
+    "track": "track with its version",
+    "rung": "rung of a ladder; empty for a track of one curriculum",
+    "given": "what the learner was given to know of tasks",
+    "fingerprint": "what the curriculum is, in 16 digits",
+    "steps": "frames that each seed learned from",
+    "best_rank": "best rank that the comparisons leave open; empty without a rank",
+    "worst_rank": "worst rank that the comparisons leave open",
+    "score": "name of the metric that orders the table",
+    "value": "its mean over seeds",
+    "low": "lower end of the 95 % interval",
+    "high": "upper end of the 95 % interval",
+    "seeds": "seeds with a value",
+    "seeds_without": "seeds without a value",
+    "bytes_per_task": "bytes kept for each further task, as the authors say",
+    "agent_bytes": "bytes of the largest agent",
+    "hours": "hours of computing of all its runs",
+    "level": f"how far it was verified: {', '.join(map(shown_level, LEVELS))}; scores: not by bits",
 }
-"""Columns of ``entries.csv`` with their types in Croissant and their meaning."""
+"""Columns of ``entries.csv`` with their meaning."""
 
 SCORE_COLUMNS = {
-    "submission": ("sc:Text", "first digits of the submission's digest"),
-    "seed": ("sc:Integer", "seed of the run"),
-    "metric": ("sc:Text", "name of the metric"),
-    "value": ("sc:Float", "its value; empty where it is undefined or the run failed"),
+    "submission": "first digits of the submission's digest",
+    "seed": "seed of the run",
+    "metric": "name of the metric",
+    "value": "its value; empty where it is undefined or the run failed",
 }
-"""Columns of ``scores.csv`` in the same way."""
+"""Columns of ``scores.csv`` with their meaning."""
 
 
 def entries_csv(tables: Sequence[BoardTable]) -> str:
@@ -257,38 +248,3 @@ def _json_line(line: Standing) -> NamedValues:
 def _numbers(estimate: Estimate) -> NamedValues:
     names = ("value", "low", "high", "n", "n_undefined", "method")
     return {name: getattr(estimate, name) for name in names}
-
-
-def model_index(tables: Sequence[BoardTable]) -> str:
-    """Return the results file that model hubs read, as YAML: ``model-index`` of the Hugging Face Hub."""
-    found: dict[str, list[ReadOnlyValues]] = {}
-    for table in tables:
-        for line in table.standings:
-            found.setdefault(line.entry.name, []).append(_result(table, line))
-    models = [{"name": name, "results": results} for name, results in found.items()]
-    return yaml.safe_dump({"model-index": models}, sort_keys=False, allow_unicode=True, width=120)
-
-
-def _result(table: BoardTable, line: Standing) -> NamedValues:
-    """Return the result of an entry: task, data set, metrics and source."""
-    variant = table.variant
-    method = line.entry.method
-    metrics = []
-    for name, estimate in line.estimates.items():
-        if estimate.value is not None:
-            text = f"{measure_name(name)}, {estimate.method}, {estimate}"
-            metrics.append({"type": name, "value": estimate.value, "name": text})
-    return {
-        "task": dict(TASK),
-        "dataset": {
-            "type": f"ctgraph_rl/{table.track.id}",
-            "name": f"ctgraph_rl {table.title}",
-            "config": variant.curriculum.name,
-            "revision": variant.curriculum.fingerprint,
-        },
-        "metrics": metrics,
-        "source": {
-            "name": f"submission {line.entry.id}, {line.entry.verified}",
-            "url": PAPER if method["code"]["repository"] == OURS else method["code"]["repository"],
-        },
-    }

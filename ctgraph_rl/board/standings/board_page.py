@@ -8,14 +8,12 @@ import json
 import re
 import sys
 from collections.abc import Sequence
-from datetime import date
 from pathlib import Path
 from typing import NamedTuple
 
 from ctgraph_rl import __version__, parsers
 from ctgraph_rl.board.standings import board_formats as formats
 from ctgraph_rl.board.standings.board_tables import BoardTable, tables
-from ctgraph_rl.board.standings.croissant import croissant
 from ctgraph_rl.board.standings.entries import LEVELS, BoardEntry, read_entries, shown_level
 from ctgraph_rl.checks import require
 from ctgraph_rl.disk import made_folder, write_whole
@@ -42,7 +40,6 @@ def write_board(
     paths: Sequence[Path | str],
     folder: Path | str,
     config_dir: Path | None = None,
-    published: date | None = None,
 ) -> Board:
     """Write the page and the other files of a board.
 
@@ -50,7 +47,6 @@ def write_board(
         paths: folders of submissions, or folders that hold them.
         folder: where the files go.
         config_dir: where tracks of the user are, as ``track/NAME.yaml``.
-        published: the day that the metadata names; None: today.
 
     Raises:
         ModuleNotFoundError: before any work, without what the extra ``report`` installs.
@@ -61,19 +57,13 @@ def write_board(
     require((bool(entries), why_left_out(problems)))
     made = tables(entries)
     folder = made_folder(Path(folder))
-    data = {
-        "entries.csv": (formats.entries_csv(made), formats.ENTRY_COLUMNS),
-        "scores.csv": (formats.scores_csv(made), formats.SCORE_COLUMNS),
-    }
-    about = croissant(data, "submission", published or date.today())
     files = {
         PAGE: html(made, problems),
         "board.md": formats.markdown(made),
         "tables.tex": formats.tables_tex(made),
         "board.json": json.dumps(formats.as_json(made), indent=1, allow_nan=False) + "\n",
-        **{name: content for name, (content, _) in data.items()},
-        "croissant.json": json.dumps(about, indent=2, allow_nan=False) + "\n",
-        "model-index.yaml": formats.model_index(made),
+        "entries.csv": formats.entries_csv(made),
+        "scores.csv": formats.scores_csv(made),
     }
     for name, content in files.items():
         write_whole(folder / name, content)
@@ -111,7 +101,7 @@ def main() -> None:
     parser = parsers.board()
     arguments = parser.parse_args()
     with refused_by(parser):
-        board = write_board(arguments.submissions, arguments.out, arguments.config_dir, arguments.date)
+        board = write_board(arguments.submissions, arguments.out, arguments.config_dir)
     for problem in board.problems:
         print(f"left out: {terminal_text(problem.reason)}", file=sys.stderr)
     count = sum(len(table.standings) for table in board.tables)

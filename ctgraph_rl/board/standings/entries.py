@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,8 +10,8 @@ from typing import Any, NamedTuple
 
 from ctgraph_rl.board import verify
 from ctgraph_rl.board.method_yaml import track_version
-from ctgraph_rl.board.rescore import MEASURES, Check
-from ctgraph_rl.board.submission import METHOD, METRICS, RUNS, VERIFICATION, Submission, read_submission
+from ctgraph_rl.board.rescore import MEASURES, Check, scores_of
+from ctgraph_rl.board.submission import SUBMISSION, VERIFICATION, Submission, read_submission
 from ctgraph_rl.board.tracks import Track, Variant
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, repeated, require
 from ctgraph_rl.disk import read_regular
@@ -27,9 +26,6 @@ LEVELS = ("failed", "submitted", "rescored", "rerun", "held_out")
 
 OF_FILES = {"none": "failed", **{level: level for level in LEVELS[2:]}}
 """Levels by the names that ``verification.json`` gives them."""
-
-NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?(e[+-]?[0-9]+)?")
-"""A value in ``metrics.csv``."""
 
 MOST_BYTES = 2**24
 """Largest ``verification.json`` that is read."""
@@ -135,8 +131,8 @@ def read_entries(paths: Iterable[Path | str], config_dir: Path | None = None) ->
     found: dict[str, BoardEntry] = {}
     problems: list[Problem] = []
     for path in map(Path, paths):
-        files, deep = files_below(path, (METHOD,))
-        folders = [file.parent for file in files if (file.parent / RUNS).is_file()]
+        files, deep = files_below(path, (SUBMISSION,))
+        folders = [file.parent for file in files]
         problems += map(Problem, deep, map(too_deep, deep))
         if not folders:
             problems.append(Problem(path, f"{path} holds no submission: ctgraph-rl submit RUNS --to DIR makes one"))
@@ -161,7 +157,7 @@ def make_entry(submission: Submission) -> BoardEntry:
     """
     track = submission.track
     name = submission.method["name"]
-    require((track is not None, f"{name} is for no track: name one in {METHOD}, or submit with --track"))
+    require((track is not None, f"{name} is for no track: name one in method.yaml, or submit with --track"))
     assert track is not None
     variant = track.variant_of(submission.curriculum)
     found = submission.curriculum.fingerprint
@@ -172,13 +168,13 @@ def make_entry(submission: Submission) -> BoardEntry:
         (own.version <= track.version, f"the newest version of the track is {track.id}{other}"),
     )
     assert variant is not None
-    names = {run.seed: run.run for run in submission.runs}
     evaluations = sum(frames > 0 for frames in submission.curriculum.moments)
     bounds = bounds_of_curriculum(submission.curriculum, max(1, evaluations))
+    by_seed = {run.seed: scores_of(submission, run) for run in submission.finished}
     values = {}
     for metric in dict.fromkeys((track.score, *MEASURES)):
         limits = bounds.of_metric(metric)
-        values[metric] = tuple(_value(submission, names.get(seed), metric, limits) for seed in track.seeds)
+        values[metric] = tuple(_value(by_seed.get(seed, {}).get(metric), metric, limits) for seed in track.seeds)
     return BoardEntry(
         digest=submission.digest,
         method=submission.method,
@@ -187,26 +183,21 @@ def make_entry(submission: Submission) -> BoardEntry:
         verification=verification_of(submission),
         seeds=track.seeds,
         values=values,
-        failed={run.seed: run.reason for run in submission.runs if not run.finished},
+        failed={run.seed: str(run.reason) for run in submission.runs if not run.finished},
         agent_bytes=max((run.agent_bytes for run in submission.runs if run.agent_bytes is not None), default=None),
         folder=submission.path,
     )
 
 
-def _value(submission: Submission, run: str | None, metric: str, bounds: Bounds) -> float | None:
+def _value(value: float | None, metric: str, bounds: Bounds) -> float | None:
     """Return a metric of a run; None for one without.
 
     Raises:
-        ValueError: for what is no finite number within the bounds of the metric.
+        ValueError: for what is not within the bounds of the metric.
     """
-    cell = "" if run is None else submission.metrics.get(run, {}).get(metric, {}).get("value", "")
-    if not cell:
-        return None
-    value = float(cell) if NUMBER.fullmatch(cell) else math.nan
     low, high = bounds
-    fits = math.isfinite(value) and within_bounds([value], bounds)
-    wanted = f"a finite number in [{low:g}, {high:g}]"
-    require((fits, f"{METRICS}: {metric} of {run} must be {wanted}, got {cell!r:.80}; verify the submission"))
+    fits = value is None or (math.isfinite(value) and within_bounds([value], bounds))
+    require((fits, f"the logs give {metric} {value}, it must be in [{low:g}, {high:g}]"))
     return value
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from datetime import date
 from pathlib import Path
 from statistics import fmean
 from string import Template
@@ -21,7 +20,6 @@ from studies.verdicts import undecided
 says = Sentences()
 
 FOLDER = HERE / "board"
-PUBLISHED = date(2026, 11, 23)
 SMALL = "small"
 
 WEIGHTS = 4 * 13956
@@ -261,7 +259,7 @@ def draw(of: BoardTable, path: Path) -> None:
 
 def make() -> None:
     """Write the page, its figure and the files of the board."""
-    made = write_board([FOLDER], FOLDER, published=PUBLISHED)
+    made = write_board([FOLDER], FOLDER)
     (FOLDER / "board.md").unlink()  # the page has the same tables
     (HERE / "board.md").write_text(page(made.tables), encoding="utf-8")
     draw(made.tables[0], HERE / "board.png")
