@@ -42,6 +42,13 @@ def test_no_curriculum_has_changed_without_a_new_version_and_all_are_in_the_tabl
     assert found == TABLE
 
 
+def test_no_fingerprint_of_a_named_curriculum_reads_as_a_number():
+    for name, line in TABLE.items():
+        with pytest.raises(ValueError):
+            float(line["fingerprint"])
+            raise AssertionError(f"{name}: {line['fingerprint']}")
+
+
 def test_the_oldest_fingerprint_is_what_it_was_when_published():
     oldest = TABLE["su_b1_4tasks"]
 
