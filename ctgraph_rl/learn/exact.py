@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.nn.functional import one_hot
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from ctgraph_rl.checks import Rule, fraction, require
+from ctgraph_rl.checks import Rule, fraction, require, takes_numbers
 from ctgraph_rl.core.graph import WAIT_ACTION, StateType
 from ctgraph_rl.core.rewards import Arrival
 from ctgraph_rl.learn.collect import PREVIOUS_ACTION, TRIAL, InitialState, Step
@@ -102,6 +102,7 @@ def exact_success(policy: ActionProbs | nn.Module, task: Task) -> float:
     return _of_function(policy, task, 1.0).success_rate
 
 
+@takes_numbers
 def exact_value(policy: ActionProbs | nn.Module, task: Task, gamma: float = 1.0) -> float:
     """Return the expected discounted return of a policy without memory; arguments as `exact_success`.
 

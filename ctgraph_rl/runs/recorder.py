@@ -16,6 +16,7 @@ from ctgraph_rl.checks import (
     as_path,
     is_int,
     is_json_object,
+    not_negative,
     plain,
     require,
     takes_numbers,
@@ -134,6 +135,7 @@ class Recorder:
             (is_json_object(about), f"about must be plain JSON values by name, got {about!r}"),
             (_is_code(code), f"code must be a list of classes and functions, such as [MyAgent], got {code!r}"),
             *true_or_false(overwrite=overwrite, resume=resume),
+            *not_negative(checkpoint_seconds=checkpoint_seconds),
             (
                 not (overwrite is True and resume is True),
                 "give either overwrite or resume: a run is replaced or resumed",
