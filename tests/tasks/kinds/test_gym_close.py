@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 import torch
 
+from baselines.exchanges.isolated import Isolated
 from ctgraph_rl import Block, Curriculum, Evaluation, GymTask, Recorder, evaluate, learn_curriculum, make_agent
 from ctgraph_rl.batch.gym_env import GymEnv
+from ctgraph_rl.learn.collective import Member, learn_collective
 
 
 class Counted(gymnasium.Env):
@@ -127,6 +129,20 @@ def test_an_error_and_an_interrupt_leave_none_open(steps, interrupts):
         learn_curriculum(curriculum, agent)
 
 
+def test_a_collective_leaves_none_open_where_a_member_fails():
+    curriculum = curriculum_of(*TASKS)
+    members = []
+    for seed in (0, 1):
+        agent = make_agent("a2c", curriculum, num_envs=4, num_steps=8, hidden_size=4)
+        members.append(Member(curriculum, agent, seed))
+    Counted.fails_after = 45
+
+    with pytest.raises(OSError, match="the game crashed") as caught:
+        learn_collective(members, Isolated(2, 1, 0.0, 0.0))
+    assert not OPEN
+    assert caught.tb  # which holds the members
+
+
 def test_an_error_of_a_policy_leaves_none_open():
     with pytest.raises(ZeroDivisionError):
         evaluate(lambda data: 1 / 0, TASKS, 2)
@@ -166,9 +182,11 @@ def test_rows_that_were_made_are_closed_where_a_later_one_cannot_be_made(monkeyp
         return made[-1]
 
     monkeypatch.setattr(GymTask, "make", make_two)
-    with pytest.raises(OSError, match="too many"):
+    with pytest.raises(OSError, match="too many") as caught:
         GymEnv(TASKS * 2)
+    assert not OPEN
     assert len(made) == 2
+    assert caught.tb  # which holds the environment, so that it is not closed as garbage
 
 
 def test_an_environment_that_fails_to_close_hides_no_error_and_keeps_no_other_open(capsys):

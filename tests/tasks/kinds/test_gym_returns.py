@@ -99,7 +99,8 @@ def test_rows_that_share_the_buffer_of_an_observation_show_their_own():
 class Changes(Returns):
     """Writes into its action, and refuses what is no action."""
 
-    action_space = Box(-0.1, 0.1, (2,), np.float64)
+    def __init__(self, dtype):
+        self.action_space = Box(-0.1, 0.1, (2,), np.dtype(dtype).type)
 
     def step(self, action):
         assert action in self.action_space
@@ -108,18 +109,25 @@ class Changes(Returns):
         return super().step(action)
 
 
-def test_an_action_is_given_in_the_space_s_own_numbers_and_is_the_environment_s_to_change():
-    gymnasium.register("returns/Changes-v0", Changes, max_episode_steps=4)
-    env = GymEnv([GymTask("returns/Changes-v0")])
-    data = env.reset().set("action", env.action_spec.space.high)
-    other = GymEnv([GymTask("returns/Changes-v0")])
+gymnasium.register("returns/Changes-v0", Changes, max_episode_steps=4)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_an_action_is_given_in_the_space_s_own_numbers_and_is_the_environment_s_to_change(dtype):
+    task = GymTask("returns/Changes-v0", {"dtype": dtype})
+    env = GymEnv([task])
+    other = GymEnv([task])
+    most = env.action_spec.space.high.clone()
+    data = env.reset().set("action", most.clone())
 
     step = env.step(data)
+    after = step["action"].clone()
+    step["action"].zero_()
     other.load_state_dict(env.state_dict())
 
     assert step["next", "reward"].item() == pytest.approx(0.1)
-    assert step["action"].equal(env.action_spec.space.high)
-    assert other._actions[0][0].tolist() == step["action"][0].tolist()
+    assert after.equal(most)
+    assert other._actions[0][0].tolist() == most[0].tolist()
 
 
 def test_each_row_reads_integers_from_its_own_space():
@@ -201,6 +209,18 @@ def test_what_is_not_finite_is_named_with_environment_task_and_frame(what, value
     place = rf"returns/Breaks-v0 \(mine\): {said}.* \(frame 45, step 23 of an episode with seed \d+\)"
     with pytest.raises(FloatingPointError, match=place):
         env.rollout(30)
+
+
+def test_a_resumed_environment_counts_its_frames_on():
+    task = GymTask("returns/Breaks-v0", label="mine")
+    env = GymEnv([task])
+    other = GymEnv([task])
+    data = env.rollout(20)[:, -1]["next"].exclude("reward")
+
+    other.load_state_dict(env.state_dict())
+
+    with pytest.raises(FloatingPointError, match=r"\(frame 23, step 23 of"):
+        other.rollout(5, auto_reset=False, tensordict=data)
 
 
 def test_evaluations_and_recorders_name_it_too():
