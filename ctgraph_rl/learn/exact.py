@@ -228,7 +228,10 @@ class _Shown:
 
     def data(self, images: Tensor, is_init: bool) -> Step:
         """Return the data of rows that see images, uint8 [n, *shape]."""
-        data: Step = {"observation": images, "is_init": torch.full([len(images), 1], is_init, device="cpu")}
+        data: Step = {
+            "observation": images,
+            "is_init": torch.full([len(images), 1], is_init, dtype=torch.bool, device="cpu"),
+        }
         if self.task_id is not None:
             data["task_id"] = self.task_id.expand(len(images), -1)
         return data
@@ -240,11 +243,11 @@ def _table(policy: Any, task: Task, shown: _Shown) -> Tensor:
     Each observation draws a view of an id, so an id's probabilities are the mean over its views.
     """
     x = task.observations
-    ids = torch.cat([torch.arange(first, last + 1) for first, last in (x.wait_ids, x.decision_ids)])
+    ids = torch.cat([torch.arange(first, last + 1, device="cpu") for first, last in (x.wait_ids, x.decision_ids)])
     views = _num_views(task)
-    rows = (ids.unsqueeze(1) * views + torch.arange(views)).flatten()
+    rows = (ids.unsqueeze(1) * views + torch.arange(views, device="cpu")).flatten()
     probs, _ = policy.action_probs(shown.data(shown.bank.index_select(0, rows), False))
-    table = torch.full([task.images.num_images, probs.shape[1]], 1 / probs.shape[1], dtype=torch.float64)
+    table = torch.full([task.images.num_images, probs.shape[1]], 1 / probs.shape[1], dtype=torch.float64, device="cpu")
     table[ids] = probs.double().view(len(ids), views, -1).mean(1)
     return table
 
@@ -293,14 +296,14 @@ class _Enumeration:
 
     def measures(self, start: Step) -> Measures:
         """Return the measures of all histories that begin with a recurrent state, of one row."""
-        ones = torch.ones(1, dtype=torch.float64)
-        self._at_home(_Histories(torch.zeros(1, dtype=torch.int64), ones, ones, start))
+        ones = torch.ones(1, dtype=torch.float64, device="cpu")
+        self._at_home(_Histories(torch.zeros(1, dtype=torch.int64, device="cpu"), ones, ones, start))
         return self.sums
 
     def _paid(self) -> Tensor:
         """Return what end states pay, float64 [b^d]."""
         graph = self.task.graph
-        leaf = torch.arange(graph.num_end_states)
+        leaf = torch.arange(graph.num_end_states, device="cpu")
         sizes = (torch.full_like(leaf, graph.branching_factor), torch.full_like(leaf, graph.depth))
         arrival = Arrival(leaf, torch.full_like(leaf, self.task.goal_leaf), *sizes, graph.depth)
         return self.task.goal_reward * self.task.reward_fn(arrival).double()
@@ -364,9 +367,9 @@ class _Enumeration:
             ids = first + (before + histories.node - self.task.graph.first_node(level)) % (last - first + 1)
             ids = ids.unsqueeze(1)
         else:
-            ids = torch.arange(first, last + 1).expand(count, -1)
-        images = (ids.unsqueeze(2) * views + torch.arange(views)).flatten(1)
-        rows = torch.arange(count).repeat_interleave(images.shape[1])
+            ids = torch.arange(first, last + 1, device="cpu").expand(count, -1)
+        images = (ids.unsqueeze(2) * views + torch.arange(views, device="cpu")).flatten(1)
+        rows = torch.arange(count, device="cpu").repeat_interleave(images.shape[1])
         seen = histories.select(rows)
         seen.weight = seen.weight / images.shape[1]
         data = self.shown.data(self.bank.index_select(0, images.flatten()), is_init)
@@ -409,7 +412,7 @@ class _Enumeration:
 
 def _parts(histories: _Histories) -> Iterator[_Histories]:
     """Yield parts of histories that are played at once; none where there is none."""
-    for rows in torch.arange(len(histories.node)).split(HISTORIES_AT_ONCE):
+    for rows in torch.arange(len(histories.node), device="cpu").split(HISTORIES_AT_ONCE):
         if len(rows):
             yield histories.select(rows)
 

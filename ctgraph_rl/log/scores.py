@@ -284,7 +284,7 @@ def mastery_thresholds(tasks: Sequence[TaskLike]) -> Tensor | Undefined:
         returns = torch.where(positive, returns, best - (1 - share) * (best - worst))
     if not are_graphs(tasks):
         return returns
-    pays = torch.tensor([task.goal_reward > max(task.fail_reward, 0) for task in tasks])
+    pays = torch.tensor([task.goal_reward > max(task.fail_reward, 0) for task in tasks], dtype=torch.bool, device="cpu")
     shares = torch.where(pays, share, torch.nan).double()
     return torch.where(_have_noise(tasks), shares, returns)
 
@@ -303,7 +303,9 @@ def evaluation_noise(task: TaskLike, evaluation: Evaluation) -> float:
 
 
 def _have_noise(tasks: Sequence[TaskLike]) -> Tensor:
-    return torch.tensor([isinstance(task, Task) and task.reward_std > 0 for task in tasks])
+    return torch.tensor(
+        [isinstance(task, Task) and task.reward_std > 0 for task in tasks], dtype=torch.bool, device="cpu"
+    )
 
 
 def _mastery_curves(log: RunLog, curriculum: Curriculum, returns: Curves) -> Curves:

@@ -195,7 +195,7 @@ def relative_forgetting(curves: Curves, noise: Tensor | float = 0.0) -> Tensor:
     if curves.performance[-1].isnan().any():
         raise Undefined("the last evaluation of a task is missing")
     best = curves.performance.nan_to_num(nan=-torch.inf).amax(0)
-    above_noise = best > NOISE * torch.as_tensor(noise)
+    above_noise = best > NOISE * torch.as_tensor(noise, dtype=torch.float64, device="cpu")
     return ratio(best - curves.performance[-1], torch.where(above_noise, best, 0.0))
 
 

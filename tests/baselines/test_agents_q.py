@@ -150,6 +150,16 @@ def test_dqn_with_priorities_remembers_errors_and_weighs_its_loss(small_agent):
     torch.testing.assert_close(losses["loss_value"], weighed.sum() / sample["priority_weight"].sum())
 
 
+def test_a_priority_is_the_size_of_an_error_and_not_its_square(small_agent):
+    agent = small_agent("dqn", [ct_su_b1()], "agent.priority_alpha=0.6", "agent.num_updates=1", "agent.batch_size=64")
+    agent.learn(batches(agent, ct_su_b1(), 1)[0])
+
+    agent.replayed = torch.tensor([3, 5])
+    agent.after_update({"loss_value": torch.tensor(1.0), "td_error": torch.tensor([9.0, 0.25])})
+
+    assert agent.replay.sampler.priorities[[3, 5]].tolist() == pytest.approx([3, 0.5], abs=1e-6)
+
+
 def test_dqn_with_priorities_goes_on_as_if_never_stopped(small_agent):
     agent, other = (small_agent("dqn", [ct_su_b1()], "agent.priority_alpha=0.6", f"seed={i}") for i in (0, 1))
     first, second = batches(agent, ct_su_b1(), 2)

@@ -17,6 +17,7 @@ from ctgraph_rl import (
     Curriculum,
     Evaluation,
     Gradient,
+    OneHot,
     Protocol,
     evaluate,
     exact_success,
@@ -25,7 +26,8 @@ from ctgraph_rl import (
     make_agent,
 )
 from ctgraph_rl.learn.collect import PREVIOUS_ACTION
-from ctgraph_rl.learn.exact import count_histories, exact_measures
+from ctgraph_rl.learn.exact import count_histories, exact_measures, shown_id
+from ctgraph_rl.learn.logits_policy import LogitsPolicy
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_posr_b1, ct_su_b1
 from ctgraph_rl.tasks.values import open_loop_ceiling
 
@@ -258,6 +260,27 @@ def test_a_goal_that_changes_has_no_exact_measures():
 def test_adaptation_is_not_exact():
     with pytest.raises(ValueError, match="exact must be false with adapt_episodes=3"):
         Evaluation(exact=True, adapt_episodes=3)
+
+
+def test_the_id_that_is_shown_is_one_hot_zeros_for_a_held_out_task_and_none_where_ids_are_hidden():
+    hidden = curricula.load("su_b1_4tasks")
+    shown = replace(hidden, protocol=Protocol(task_id="one_hot"))
+    held_out = replace(hidden.tasks[0], images=replace(hidden.tasks[0].images, seed=9))
+
+    assert shown_id(hidden, hidden.tasks[1]) is None
+    assert shown_id(shown, hidden.tasks[1]).tolist() == [0, 1, 0, 0]
+    assert shown_id(shown, held_out).tolist() == [0, 0, 0, 0]
+
+
+def test_vectors_are_padded_to_those_of_longer_tasks_as_episodes_show_them():
+    short = replace(ct_su_b1(), images=OneHot(ct_su_b1().images.num_images))
+    long = replace(ct_su_b1(), images=OneHot(9))
+    policy = LogitsPolicy(Spread(9), 3)
+
+    found = exact_measures(policy, short, greedy=True, shape=long.observation_shape)
+    ends, _ = evaluate(policy, [short, long], 2)
+
+    assert ends["step_count"].tolist() == [[found.length_mean]] * 2
 
 
 def test_the_count_of_histories_is_that_of_the_images_drawn():
