@@ -18,12 +18,10 @@ from ctgraph_rl.log.escape import listed
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.parsers import LEVELS
+from ctgraph_rl.report.columns import board_columns
 from ctgraph_rl.runs.settings import differences
 
 RESCORED = LEVELS[0]
-
-MEASURES = ("average_performance", "forgetting")
-"""Metrics that each table of a board shows beside the score of its track."""
 
 NO_ROW: ReadOnlyValues = {}
 
@@ -71,7 +69,7 @@ def rescore(submission: Submission) -> list[Check]:
 
 
 def scores_of(submission: Submission, run: SubmittedRun) -> dict[str, float | None]:
-    """Return what a board shows of a finished run, from its log: the score of the track and `MEASURES`.
+    """Return what a board shows of a finished run, from its log: the score of the track and `board_columns`.
 
     Raises:
         ValueError: if the log is another one than the submission names, or of another curriculum.
@@ -80,7 +78,9 @@ def scores_of(submission: Submission, run: SubmittedRun) -> dict[str, float | No
     own = log_sum(log) == run.log_sha256
     require((own, f"the log of {run.run} is another one than the submission names: restore it"))
     found = scores(log, submission.curriculum, submission.experts(run, log))
-    names = MEASURES if submission.track is None else (submission.track.score, *MEASURES)
+    names = board_columns(submission.curriculum)
+    if submission.track is not None:
+        names = [submission.track.score, *names]
     return {name: found[name].value for name in names}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -25,6 +26,7 @@ from ctgraph_rl.metrics.record import HERE, MASTERED, Undefined, defined, float6
 
 CONTINUAL_WORLD = "Wolczyk et al. 2021, Continual World (arXiv 2105.10919)"
 LABS = "Ben-Iwhiwhu et al. 2022, Lifelong RL with modulating masks (arXiv 2212.11110)"
+EBBINGHAUS = "ctgraph_rl, after the savings of relearning in Ebbinghaus 1885, Ueber das Gedaechtnis"
 LABS_CODE = "evaluation code of the CT-graph labs"
 
 OF_MASTERY = {"curves": "mastery_curves", "threshold": "mastery_thresholds"}
@@ -257,6 +259,65 @@ def frames_to_mastery(curves: Curves, threshold: Tensor | float = MASTERED) -> T
     if not found:
         raise Undefined("the definition needs a block that trains one task")
     return float64(found)
+
+
+@defined(
+    "ctgraph_rl/regain",
+    "mean over returns of tasks j, mastered in their first block, of (frames from the start of the block of the return "
+    "to p_j >= threshold_j) / (the same of j's first block), p_j as in ctgraph_rl/tasks-learned",
+    EBBINGHAUS,
+    missing="a task was not mastered again when it returned",
+    inputs=OF_MASTERY,
+    bounds=not_negative,
+    is_time=True,
+)
+def regain(curves: Curves, threshold: Tensor | float = MASTERED) -> Tensor:
+    """Frames until a task that returns is mastered again, as a share of the frames that it took the first time.
+
+    0: it was kept, as the last evaluation before the return finds it mastered. 1: it takes as long as at first. The
+    source's savings of relearning are 1 less this. A task returns where a block trains it alone after other tasks.
+    Tasks that were not mastered in their first block are left out; undefined if a task was not mastered again.
+
+    Args:
+        curves: as in `tasks_learned`.
+        threshold: as there.
+    """
+    returns = find_returns(curves.trained)
+    if not returns:
+        raise Undefined("the definition needs a task that a block trains alone again, after other tasks")
+    num_tasks = curves.performance.shape[1]
+    needed = torch.as_tensor(threshold, dtype=curves.performance.dtype, device="cpu").expand(num_tasks)
+    found = []
+    for task, first, again in returns:
+        frames = _frames_to(needed[task], curves, first, task)
+        if not math.isnan(frames):
+            before = curves.ends[again - 1, task]
+            found.append(0.0 if before >= needed[task] else _frames_to(needed[task], curves, again, task) / frames)
+    if not found:
+        raise Undefined("no task that returns was mastered in its first block")
+    return float64(found)
+
+
+def find_returns(trained: Sequence[Sequence[int]]) -> list[tuple[int, int, int]]:
+    """Return each return of a task: the task, its first block, and a later one after other tasks, all trained alone.
+
+    Args:
+        trained: for each block, its tasks; blocks are counted from 1.
+    """
+    first: dict[int, int] = {}
+    shared = set()
+    found = []
+    before: set[int] = set()
+    for block, tasks in enumerate(trained, 1):
+        own = {*tasks}
+        for task in own:
+            if len(own) > 1 and task not in first:
+                shared.add(task)
+            first.setdefault(task, block)
+            if len(own) == 1 and first[task] < block and task not in before and task not in shared:
+                found.append((task, first[task], block))
+        before = own
+    return found
 
 
 def _frames_to(needed: Tensor, curves: Curves, block: int, task: int) -> float:

@@ -22,6 +22,7 @@ from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.tables import check_table, write_evaluations
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.bounds_of_runs import BoundsOfRuns, bounds_by_curriculum
+from ctgraph_rl.report.columns import WHERE_KNOWN, columns_of_runs
 from ctgraph_rl.report.formats import FORMATS, LEGENDS, NO_RUN_FINISHED, SENTENCES
 from ctgraph_rl.report.intervals import scipy
 from ctgraph_rl.report.names import displayed, modifications
@@ -31,15 +32,6 @@ from ctgraph_rl.runs.read import BySeed, Run, find_runs, grouped, present, why_l
 
 SOLVED = 0.9
 """Success rate from which on a task counts as solved."""
-
-WHERE_KNOWN = (
-    *(metric.__name__ for metric in metrics.AGAINST_EXPERTS),
-    *("continual_world_forward_transfer", "forward_transfer_from_experts", "memory_gap_closed"),
-)
-"""Metrics that are shown where some run of a curriculum has a value."""
-
-SHOWN = (*(metric.__name__ for metric in metrics.SUMMARY), "solved_rate")
-"""Measures that are always shown; ``mean_final_return`` is the average performance of runs that were evaluated last."""
 
 _HERE = metrics.record.HERE
 AT_END = {
@@ -82,6 +74,7 @@ class Row:
         definition: id of the metric's definition.
         note: why seeds have no value.
         seed: of the run that it is of; None for all seeds.
+        columns: the metrics that tables show of its curriculum, see `ctgraph_rl.report.columns.columns`.
     """
 
     curriculum: str
@@ -91,6 +84,7 @@ class Row:
     definition: str
     note: str
     seed: int | None = None
+    columns: Sequence[str] = ()
 
     @property
     def kind(self) -> str:
@@ -119,13 +113,14 @@ def table(runs: Sequence[Run], statistics: str = "exact", count: Count = silent)
         ModuleNotFoundError: for several seeds without scipy.
     """
     bounds = bounds_by_curriculum(runs)
+    shown = columns_of_runs(runs)
     rows = []
     groups = grouped(runs)
     if any(len(by_seed) > 1 for by_seed in groups.values()):
         scipy("stats")
     for done, ((name, agent), by_seed) in enumerate(groups.items(), 1):
         for line in _lines(by_seed, bounds[name], statistics):
-            rows.append(Row(name, agent, *line))
+            rows.append(Row(name, agent, *line, columns=shown[name]))
         count("agents", done, len(groups))
     return rows
 
@@ -133,11 +128,12 @@ def table(runs: Sequence[Run], statistics: str = "exact", count: Count = silent)
 def rows_by_seed(runs: Sequence[Run]) -> list[Row]:
     """Every metric, and how tasks ended, of each run, without intervals."""
     bounds = bounds_by_curriculum(runs)
+    shown = columns_of_runs(runs)
     rows = []
     for (name, agent), by_seed in grouped(runs).items():
         for seed, run in by_seed.items():
             for line in _lines({seed: run}, bounds[name], "std"):
-                row = Row(name, agent, *line, seed=seed)
+                row = Row(name, agent, *line, seed=seed, columns=shown[name])
                 if row.measure != "interquartile_return":
                     rows.append(_without_interval(row))
     return rows
@@ -191,9 +187,9 @@ def selected(rows: Sequence[Row], names: Sequence[str] | None = None, also: Sequ
 
     Args:
         rows: the whole table.
-        names: of measures, ``solved`` for all tasks' shares; None: `SHOWN`, and `WHERE_KNOWN` where a run
-            of the curriculum has a value.
-        also: measures that are shown with `SHOWN`.
+        names: of measures, ``solved`` for all tasks' shares; None: those of the curriculum, the solved rate, and
+            `WHERE_KNOWN` where a run of the curriculum has a value.
+        also: measures that are shown with these.
 
     Raises:
         ValueError: for a name that no row has.
@@ -207,9 +203,13 @@ def selected(rows: Sequence[Row], names: Sequence[str] | None = None, also: Sequ
             with_value.add((row.curriculum, row.measure))
     unknown = [name for name in names or () if name not in choices]
     require((not choices or not unknown, _no_measure(unknown, choices)))
-    always = (*SHOWN, *also, NO_RUN_FINISHED) if names is None else (*names, NO_RUN_FINISHED)
-    further = with_value if names is None else ()
-    return [row for row in rows if row.kind in always or (row.curriculum, row.measure) in further]
+    found = []
+    for row in rows:
+        wanted = (*row.columns, "solved_rate", *also) if names is None else names
+        is_known = names is None and (row.curriculum, row.measure) in with_value
+        if row.kind in (*wanted, NO_RUN_FINISHED) or is_known:
+            found.append(row)
+    return found
 
 
 def _no_measure(unknown: Sequence[str], choices: Iterable[str]) -> str:

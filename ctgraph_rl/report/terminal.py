@@ -18,18 +18,17 @@ from rich.text import Text
 from ctgraph_rl.checks import ReadOnlyValues, require
 from ctgraph_rl.log.escape import listed, terminal_text
 from ctgraph_rl.log.provenance import numbers_of
+from ctgraph_rl.report.columns import WHERE_KNOWN, columns
 from ctgraph_rl.report.formats import measure_name
 from ctgraph_rl.report.names import modification
 from ctgraph_rl.runs.read import FOLDER, Curve, History, Problem, Run, code_of, read_run
 from ctgraph_rl.runs.settings import as_before
 
-ALWAYS = ("average_performance", "forward_transfer", "backward_transfer", "forgetting")
 LIFELONG = {
     "forward_transfer_ratio": "forward transfer ratio",
     "backward_transfer_ratio": "backward transfer ratio",
 }
-"""Transfer as ratios, of which 1 means none, beside the differences in `ALWAYS`, of which 0 means none."""
-WITH_EXPERTS = ("continual_world_forward_transfer", "relative_performance", "sample_efficiency")
+"""Transfer as ratios, of which 1 means none, beside differences, of which 0 means none."""
 OF_DETECTION = ("detection_delay", "false_alarms", "labels_per_task", "label_agreement")
 """Metrics that are shown; the others are in the file."""
 
@@ -66,7 +65,8 @@ def print_summary(run_dir: Path | str, console: Console | None = None) -> None:
     modified = modification(run)
     if modified:
         console.print(_text(f"{run.curriculum[0]}: {modified}"))
-    for table in (*tables, metrics_table(run.metrics)):
+    always = columns(run.history.trained, bool(run.history.adaptation))
+    for table in (*tables, metrics_table(run.metrics, always)):
         console.print(table)
 
 
@@ -171,15 +171,15 @@ def _shown(value: float) -> str:
     return "-" if math.isnan(value) else f"{value:z.2f}"
 
 
-def metrics_table(metrics: Mapping[str, ReadOnlyValues]) -> Table:
-    """Return the main metrics with their definitions, or why one is undefined; others where they have a value."""
+def metrics_table(metrics: Mapping[str, ReadOnlyValues], always: Sequence[str]) -> Table:
+    """Return metrics with their definitions, or why one of ``always`` is undefined; others where they have a value."""
     table = Table(title=f"Metrics; metrics.json has all {len(metrics)}")
     for name, justify in (("metric", "left"), ("value", "right"), ("definition", "left")):
         table.add_column(name, justify=justify)  # type: ignore[arg-type]
-    for name in (*ALWAYS, *LIFELONG, *WITH_EXPERTS, *OF_DETECTION):
-        if name not in ALWAYS and metrics.get(name, {}).get("value") is None:
+    for name in (*always, *LIFELONG, *WHERE_KNOWN, *OF_DETECTION):
+        metric = metrics.get(name)
+        if metric is None or (name not in always and metric["value"] is None):
             continue
-        metric = metrics[name]
         value = "undefined" if metric["value"] is None else f"{metric['value']:z.2f}"
         neutral = "1 is neutral: " if name in LIFELONG else ""
         table.add_row(measure_name(name), value, _text(neutral + (metric["undefined"] or metric["formula"])))

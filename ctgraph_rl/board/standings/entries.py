@@ -10,13 +10,14 @@ from typing import Any, NamedTuple
 
 from ctgraph_rl.board import verify
 from ctgraph_rl.board.method_yaml import track_version
-from ctgraph_rl.board.rescore import MEASURES, Check, scores_of
+from ctgraph_rl.board.rescore import Check, scores_of
 from ctgraph_rl.board.submission import SUBMISSION, VERIFICATION, Submission, read_submission
 from ctgraph_rl.board.tracks import Track, Variant
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, repeated, require
 from ctgraph_rl.disk import read_regular
 from ctgraph_rl.log.escape import listed
 from ctgraph_rl.report.bounds_of_runs import bounds_of_curriculum
+from ctgraph_rl.report.columns import board_columns
 from ctgraph_rl.report.intervals import Bounds, within_bounds
 from ctgraph_rl.runs.read import Problem
 from ctgraph_rl.strict import files_below, json_value, one_line_of, too_deep
@@ -59,7 +60,7 @@ class BoardEntry:
         variant: what it learned.
         verification: how far it was verified.
         seeds: of the track.
-        values: of the track's score and `MEASURES`, one for each seed; None for a seed without a value.
+        values: of the track's score and `board_columns`, one for each seed; None for a seed without a value.
         failed: why seeds failed.
         agent_bytes: of the largest agent; None where no run left one.
         folder: of the submission.
@@ -172,7 +173,7 @@ def make_entry(submission: Submission) -> BoardEntry:
     bounds = bounds_of_curriculum(submission.curriculum, max(1, evaluations))
     by_seed = {run.seed: scores_of(submission, run) for run in submission.finished}
     values = {}
-    for metric in dict.fromkeys((track.score, *MEASURES)):
+    for metric in dict.fromkeys((track.score, *board_columns(submission.curriculum))):
         limits = bounds.of_metric(metric)
         values[metric] = tuple(_value(by_seed.get(seed, {}).get(metric), metric, limits) for seed in track.seeds)
     return BoardEntry(

@@ -1,0 +1,67 @@
+"""The metrics that tables show of a curriculum: of a run, a sweep, a report, a paper and the board alike."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ctgraph_rl import metrics
+from ctgraph_rl.metrics import METRICS, Trained
+from ctgraph_rl.metrics.curves import find_returns
+from ctgraph_rl.runs.read import History, Run, grouped, present
+from ctgraph_rl.tasks.curriculum import Curriculum
+
+IN_ORDER = tuple(metric.__name__ for metric in metrics.SUMMARY)
+"""Metrics of tasks that are each trained once, one after the other."""
+
+TRANSFER = ("forward_transfer", "backward_transfer")
+
+WHERE_KNOWN = (
+    "isolated_forgetting",
+    *("first_success", "held_out_adapted_return", "held_out_search_regret"),
+    *(metric.__name__ for metric in metrics.AGAINST_EXPERTS),
+    *("continual_world_forward_transfer", "forward_transfer_from_experts", "memory_gap_closed"),
+)
+"""Metrics that are shown where some run of a curriculum has a value."""
+
+
+def columns(trained: Trained, adapts: bool) -> tuple[str, ...]:
+    """Return the metrics that a table shows of a curriculum whether or not they have a value.
+
+    Transfer and forgetting need several blocks. Where each trains one task, and each task comes once, they are those of
+    `IN_ORDER`; else forgetting is `relative_forgetting`, and `regain` stands beside it where a task returns.
+
+    Args:
+        trained: for each block, its tasks; empty where a log does not say it.
+        adapts: whether rows adapt before they are evaluated.
+    """
+    tasks = [task for block in trained for task in set(block)]
+    once = len(set(tasks)) == len(tasks) == len(trained)
+    names = ["average_performance"]
+    if not trained or (once and len(trained) > 1):
+        names = [*IN_ORDER]
+    elif len(trained) > 1:
+        names.append("relative_forgetting")
+    if find_returns(trained):
+        names.append("regain")
+    if adapts:
+        names += ["adapted_return", "search_regret"]
+    return tuple(names)
+
+
+def board_columns(curriculum: Curriculum) -> list[str]:
+    """Return `columns` of a curriculum without transfer, and without times, whose means leave out what never ended."""
+    shown = columns(curriculum.trained, curriculum.evaluation.adapt_episodes > 0)
+    return [name for name in shown if name not in TRANSFER and not METRICS[name].is_time]
+
+
+def columns_of_runs(runs: Sequence[Run]) -> dict[str, tuple[str, ...]]:
+    """Return `columns` of each curriculum, by its name in tables."""
+    histories: dict[str, list[History]] = {}
+    for (name, _), by_seed in grouped(runs).items():
+        known = [run.history for run in present(by_seed) if run.history is not None]
+        histories.setdefault(name, []).extend(known)
+    found = {}
+    for name, some in histories.items():
+        trained = max((history.trained for history in some), key=len, default=())
+        found[name] = columns(trained, any(history.adaptation for history in some))
+    return found
