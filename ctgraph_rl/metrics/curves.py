@@ -275,7 +275,7 @@ def regain(curves: Curves, threshold: Tensor | float = MASTERED) -> Tensor:
     """Frames until a task that returns is mastered again, as a share of the frames that it took the first time.
 
     0: it was kept, as the last evaluation before the return finds it mastered. 1: it takes as long as at first. The
-    source's savings of relearning are 1 less this. A task returns where a block trains it alone after other tasks.
+    source's savings of relearning are 1 less this. A task returns where a block trains only it, after other tasks.
     Tasks that were not mastered in their first block are left out; undefined if a task was not mastered again.
 
     Args:
@@ -284,7 +284,7 @@ def regain(curves: Curves, threshold: Tensor | float = MASTERED) -> Tensor:
     """
     returns = find_returns(curves.trained)
     if not returns:
-        raise Undefined("the definition needs a task that a block trains alone again, after other tasks")
+        raise Undefined("the definition needs a block of only one task that was trained before, with other tasks between")
     num_tasks = curves.performance.shape[1]
     needed = torch.as_tensor(threshold, dtype=curves.performance.dtype, device="cpu").expand(num_tasks)
     found = []
@@ -299,7 +299,7 @@ def regain(curves: Curves, threshold: Tensor | float = MASTERED) -> Tensor:
 
 
 def find_returns(trained: Sequence[Sequence[int]]) -> list[tuple[int, int, int]]:
-    """Return each return of a task: the task, its first block, and a later one after other tasks, all trained alone.
+    """Return each return of a task: the task, its first block, and a later one after other tasks; each trains only it.
 
     Args:
         trained: for each block, its tasks; blocks are counted from 1.
