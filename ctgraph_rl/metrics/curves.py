@@ -284,7 +284,7 @@ def regain(curves: Curves, threshold: Tensor | float = MASTERED) -> Tensor:
     """
     returns = find_returns(curves.trained)
     if not returns:
-        raise Undefined("the definition needs a block of only one task that was trained before, with other tasks between")
+        raise Undefined("the definition needs a block of one task that was trained before, with other tasks between")
     num_tasks = curves.performance.shape[1]
     needed = torch.as_tensor(threshold, dtype=curves.performance.dtype, device="cpu").expand(num_tasks)
     found = []

@@ -138,5 +138,5 @@ def test_curricula_without_a_return_have_no_regain():
     for frames in recorder.moments:
         recorder.evaluate(policy(1)[0], frames)
 
-    reason = "the definition needs a block of only one task that was trained before, with other tasks between"
+    reason = "the definition needs a block of one task that was trained before, with other tasks between"
     assert recorder.metrics["regain"].undefined == reason
