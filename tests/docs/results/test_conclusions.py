@@ -9,12 +9,34 @@ from helpers.opposite import Table, empty, mirror, shuffle, write_changed
 from studies import raw
 from studies.sentences import Sentences
 
+SCORES = ("greedy_return", "greedy_success", "sampled_return", "sampled_success")
+RETURNS = tuple(map(str, range(1, 13)))
+
 TABLES = {
     "studies.adaptation": [
         Table("adaptation", ("success",), ("agent", "gate")),
         Table("adaptation_swap", ("success",), ("agent",)),
     ],
+    "studies.baselines.conclusions": [
+        *(Table(name, SCORES, ("agent",)) for name in ("baselines_b1", "baselines_b1_instances", "depth_ladder")),
+        Table("rnd_depth", SCORES, ("depth",)),
+        Table("rl2_search", ("greedy_success",), ("depth",)),
+        Table("main_job", ("return_mean",), ("label",)),
+    ],
+    "studies.collectives.conclusions": [
+        Table("collectives", ("final_return",), ("num_members", "exchange")),
+        Table("collective_blocks", ("final_return",), ("num_members", "exchange")),
+        Table("selecting", ("evaluated",), ("method",)),
+    ],
 }
+LONG = {
+    "studies.lifelong.conclusions": [
+        Table(folder + name, RETURNS[: 12 if name == "masks_ct12" else 8], ("method",))
+        for name in ("masks_ct8", "masks_ct12", "masks_ct8_md")
+        for folder in ("", "epochs/")
+    ],
+}
+"""Pages of long tables."""
 
 
 def not_said(sentences: Sentences) -> set[str]:
@@ -29,12 +51,12 @@ def not_said(sentences: Sentences) -> set[str]:
     return found
 
 
-@pytest.mark.parametrize("page", TABLES)
+@pytest.mark.parametrize("page", [*TABLES, *(pytest.param(page, marks=pytest.mark.slow) for page in LONG)])
 def test_what_a_page_concludes_is_not_said_of_opposite_or_empty_results(page, tmp_path, monkeypatch):
     says = import_module(page).says
     found = {}
     for change in (mirror, shuffle, empty):
-        write_changed(TABLES[page], change, tmp_path / change.__name__)
+        write_changed({**TABLES, **LONG}[page], change, tmp_path / change.__name__)
         with monkeypatch.context() as patch:
             patch.setattr(raw, "HERE", tmp_path / change.__name__)
             found[change] = not_said(says)

@@ -31,30 +31,6 @@ def measured():
     return found
 
 
-@pytest.fixture(scope="module")
-def by_curriculum():
-    """For each table the means over seeds and tasks of what methods know at the end and have while learning."""
-    from studies.lifelong import mastered
-
-    tables = {name: mastered.Table(name) for name in mastered.GOALS}
-    return {
-        name: {m: (table.known(m).double().mean().item(), table.areas(m).mean().item()) for m in METHODS}
-        for name, table in tables.items()
-    }
-
-
-def test_in_short_says_on_which_curricula_the_papers_claims_hold(by_curriculum):
-    masks, short = [m for m in METHODS if "mask" in m], PAGE[: PAGE.index("Cells are means")]
-
-    more_than_ewc = {n for n, of in by_curriculum.items() if all(of[m][0] > of["ewc_published"][0] for m in masks)}
-    faster = {m: {n for n, of in by_curriculum.items() if of[m][1] > of["mask_ri"][1]} for m in ("mask_lc", "mask_blc")}
-
-    assert more_than_ewc == {"masks_ct8_md"} == faster["mask_lc"]
-    assert faster["mask_blc"] == set(by_curriculum)
-    assert "masks know more at the end than EWC holds on CT8 multi-depth, but not on CT8 and CT12 (means" in short
-    assert "holds for Mask BLC on all three curricula, and for Mask LC on CT8 multi-depth only." in short
-
-
 @pytest.fixture
 def values(measured):
     """A column of a table, for a number of epochs and a method: a value for each run."""

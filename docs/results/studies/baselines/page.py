@@ -8,6 +8,7 @@ from string import Template
 from typing import TYPE_CHECKING
 
 from studies.baselines import main_job, search, swap
+from studies.baselines.conclusions import says
 from studies.baselines.runs import AGENTS, BY_FIVES, EPISODES, REWARDS_MET
 from studies.raw import HERE, TEMPLATES, Raw, groups, machines, mean_of, read, share_of, table
 
@@ -150,7 +151,7 @@ def page() -> str:
         "depth_ladder": ladder(read("depth_ladder") + read("rnd_depth")),
     }
     template = Template((TEMPLATES / "baselines.md").read_text(encoding="utf-8"))
-    return template.substitute(
+    made = template.substitute(
         tables,
         searching=searching(),
         machines=machines("main_job", *AGENTS, *RND, *BY_FIVES, *OF_GOALS),
@@ -158,6 +159,7 @@ def page() -> str:
         **swap.texts(),
         **reruns(),
     )
+    return says.check(made)
 
 
 def draw(path: Path) -> None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cache
 from statistics import fmean, variance
 
 from studies.collectives.runs import BLOCKS
@@ -43,7 +42,6 @@ SUMS = {"isolated": (9.5, 1.0), "mosaic": (25.7, 0.8), "mosaic_no_similarity": (
 NUM_PUBLISHED = 5
 
 
-@cache
 def _cells() -> dict[tuple[str, ...], Raw]:
     return groups(read(BLOCKS), "curriculum", "exchange", "num_epochs", "num_members")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
 from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING, Any
@@ -33,7 +32,6 @@ BATCH = 1_280
 DPI = 220
 
 
-@cache
 def cells() -> dict[tuple[str, ...], Raw]:
     """Lines of collectives by the columns of `CELL`."""
     return groups(read(NAME), *CELL)
@@ -182,19 +180,30 @@ def page() -> str:
     first, *_, last = by_block("16", "8")[1:]
     texts |= {"second": f"{first:.2f}", "last": f"{last:.2f}"}
     texts |= mosaic.texts() | selecting.texts()
-    return template.substitute(l2d2c=l2d2c_table(), machines=machines(NAME, selecting.NAME), not_run=not_run(), **texts)
+    from studies.collectives.conclusions import says
+
+    made = template.substitute(l2d2c=l2d2c_table(), machines=machines(NAME, selecting.NAME), not_run=not_run(), **texts)
+    return says.check(made)
 
 
-def known_and_new(num_members: str) -> dict[str, str]:
-    """Return what members learned in blocks whose task one of them had in an earlier block, and in the others."""
+def new_and_known(num_members: str) -> tuple[Raw, Raw]:
+    """Return the blocks whose task no member had in an earlier block, and the others."""
     lines = groups(read(BLOCKS), *CELL)["l2d2c_16x16", FRAMES, "l2d2c", num_members, "1"]
     first: dict[tuple[str, str], int] = {}
     for line in lines:
         key = (line["seed"], line["task"])
         first[key] = min(int(line["block"]), first.get(key, int(line["block"])))
+    new: Raw = []
+    known: Raw = []
+    for line in lines:
+        (known if int(line["block"]) > first[line["seed"], line["task"]] else new).append(line)
+    return new, known
+
+
+def known_and_new(num_members: str) -> dict[str, str]:
+    """Return what the page says of blocks whose task a member had in an earlier block, and of the others."""
     texts = {}
-    for name, known in (("new", False), ("known", True)):
-        those = [each for each in lines if (int(each["block"]) > first[each["seed"], each["task"]]) == known]
+    for name, those in zip(("new", "known"), new_and_known(num_members), strict=True):
         learned = sum(each["frames_to_learn"] != "" for each in those)
         texts[f"{name}_return_{num_members}"] = f"{sum(numbers_in(those, 'final_return')) / len(those):.2f}"
         texts[f"{name}_learned_{num_members}"] = f"{learned} of {len(those)} blocks"

@@ -30,7 +30,7 @@ class Table:
         found = {(method, int(seed)): comparison.curves(lines) for (method, seed), lines in sorted(of.items())}
         self.curves = {who: [run for (other, _), run in found.items() if other == who] for who, _ in found}
         self.experts = torch.stack([run.performance for run in self.curves["expert"]])
-        self.goals = GOALS[name]
+        self.goals = GOALS[name.rpartition("/")[2]]
 
     def ends(self, method: str) -> torch.Tensor:
         """bool [seeds, blocks, tasks]: what is mastered after each block."""
