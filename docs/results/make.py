@@ -50,7 +50,7 @@ TABLES = {
 }
 """Tables of raw results, and the modules that collect them."""
 
-GROWING = (*OF_METHODS, "collectives", "memory_cells", "no_labels")
+GROWING = (*OF_METHODS, "claim_runs", "collectives", "memory_cells", "no_labels")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

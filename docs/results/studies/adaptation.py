@@ -191,11 +191,14 @@ def gates_table(depth: int) -> str:
     return table(["agent", *(f"`{gate}`" for gate in GATES)], rows)
 
 
-def against(first: tuple[str, str], second: tuple[str, str]) -> Comparison:
-    """Compare the success after adaptation of two agents with their gates at depth 2, on the seeds that both have."""
+Runs = dict[tuple[str, ...], dict[tuple[str, ...], Raw]]
+"""The lines of each seed, by agent and gate."""
+
+
+def against(found: Runs, first: tuple[str, ...], second: tuple[str, ...]) -> Comparison:
+    """Compare the success after adaptation of two agents with their gates, on the seeds that both have."""
     from ctgraph_rl.report import statistics
 
-    found = runs(2)
     seeds = [seed for seed in found[first] if seed in found[second]]
     values, others = ([adapted(found[key][seed]) for seed in seeds] for key in (first, second))
     return statistics.compare(values, others, bounds=SUCCESS)
@@ -204,9 +207,10 @@ def against(first: tuple[str, str], second: tuple[str, str]) -> Comparison:
 def gate_differences() -> str:
     """Return a row for each agent and gate: its success after adaptation less that without a gate, by seed."""
     rows = []
-    for agent, gate in runs(2):
+    of = runs(2)
+    for agent, gate in of:
         if gate != "none":
-            found = against((agent, gate), (agent, "none"))
+            found = against(of, (agent, gate), (agent, "none"))
             record = f"{found.wins}, {found.ties}, {found.losses}"
             rows.append(
                 [LABELS[agent], f"`{gate}`", shown(found.difference), record, str(seeds_that_would_do(found) or "-")]
@@ -220,8 +224,9 @@ RIVALS = ("cavia", "rl2", "maml")
 
 def differences() -> dict[str, str]:
     """Return what the page says of differences of agents and of a gate."""
-    found = {name: against(("pearl", "none"), (name, "none")) for name in RIVALS}
-    gated = against(("pearl", "none"), ("pearl", "hard_straight_through"))
+    of = runs(2)
+    found = {name: against(of, ("pearl", "none"), (name, "none")) for name in RIVALS}
+    gated = against(of, ("pearl", "none"), ("pearl", "hard_straight_through"))
     return {
         **{f"pearl_{name}": shown(each.difference) for name, each in found.items()},
         "order_seeds": str(max(seeds_that_would_do(each) or 0 for each in found.values())),
@@ -254,12 +259,13 @@ def _() -> bool:
 
 @says("With `hard_straight_through` PEARL ends lower in each of three seeds, by")
 def _() -> bool:
-    return against(("pearl", "none"), ("pearl", "hard_straight_through")).wins == 3
+    return against(runs(2), ("pearl", "none"), ("pearl", "hard_straight_through")).wins == 3
 
 
 @says("**Three seeds cannot say whether a gate helps.**")
 def _() -> bool:
-    gates = [against(key, (key[0], "none")) for key in runs(2) if key[1] != "none"]
+    of = runs(2)
+    gates = [against(of, key, (key[0], "none")) for key in of if key[1] != "none"]
     clear = [each for each in gates if each.p_value is not None and each.p_value <= 0.05]
     return {each.difference.n for each in gates} == {3} and clear == []
 
@@ -284,18 +290,21 @@ def _() -> bool:
 
 @says("**Five seeds cannot order the agents** on the fully observable graph: no p-value of five pairs is below 0.06.")
 def _() -> bool:
-    pairs = [against((one, "none"), (other, "none")) for one, other in combinations(LABELS, 2)]
+    of = runs(2)
+    pairs = [against(of, (one, "none"), (other, "none")) for one, other in combinations(LABELS, 2)]
     return {each.difference.n for each in pairs} == {5} and min(each.p_value or 0 for each in pairs) > 0.06
 
 
 @says("PEARL ends higher in each of five seeds:")
 def _() -> bool:
-    return all(against(("pearl", "none"), (name, "none")).wins == 5 for name in RIVALS)
+    of = runs(2)
+    return all(against(of, ("pearl", "none"), (name, "none")).wins == 5 for name in RIVALS)
 
 
 @says("no interval is on one side of 0:")
 def _() -> bool:
-    gates = [against(key, (key[0], "none")).difference for key in runs(2) if key[1] != "none"]
+    of = runs(2)
+    gates = [against(of, key, (key[0], "none")).difference for key in of if key[1] != "none"]
     return all(each.low is not None and each.high is not None and each.low < 0 < each.high for each in gates)
 
 

@@ -1,4 +1,4 @@
-"""Runs that test sentences of the paper: claim_runs.csv, and what the page of sentences says of them."""
+"""Runs that test sentences of the paper: claim_runs.csv, and effects in the direction of a sentence, one a seed."""
 
 from __future__ import annotations
 
@@ -6,28 +6,40 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
-from ctgraph_rl.report import statistics
-from ctgraph_rl.report.statistics import Estimate
 from ctgraph_rl.runs.read import MODIFIED
-from studies.raw import Raw, groups, machine_of, numbers_in, read, write
+from studies.raw import Raw, grow, machine_of, merged, read
 
 NAME = "claim_runs"
-CONDITIONS = ("depth", "reward_fn", "reward_std", "within")
-"""Settings of curricula that differ between the runs of a sentence; empty where a curriculum lacks one."""
+CONDITIONS = (
+    "depth",
+    "reward_fn",
+    "reward_std",
+    "goal_reward",
+    "within",
+    "group_size",
+    "num_wait_images",
+    "order",
+    "agent",
+    "cell",
+    "learning_rate",
+    "method",
+    "frames",
+)
+"""What differs between the runs of a sentence; empty where a curriculum or an agent lacks it."""
 
+OF_CURRICULUM = CONDITIONS[:7]
+KEY = ("curriculum", *CONDITIONS, "seed")
 METRICS = ("tasks_learned", "forgetting", "forward_transfer")
-SHARES = (0.0, 1.0)
 
 
-def collect(name: str, folders: Sequence[Path]) -> None:
+def collect(name: str, folders: Sequence[Path], add: bool) -> None:
     """Write a line for each finished run under some folders; experts of other runs are left out."""
     paths = [path.parent for folder in folders for path in folder.rglob("metrics.json")]
-    lines = [measured(path) for path in paths if path.parent.name != "experts"]
-    key = ("curriculum", *CONDITIONS, "seed")
-    write(name, sorted(lines, key=lambda line: [str(line[column]).rjust(12) for column in key]))
+    new = [measured(path) for path in paths if path.parent.name != "experts"]
+    lines = merged(name, new, KEY, add)
+    grow({name: sorted(lines, key=lambda line: [str(line[column]).rjust(12) for column in KEY])}, [])
 
 
 def measured(run: Path) -> dict[str, Any]:
@@ -38,14 +50,20 @@ def measured(run: Path) -> dict[str, Any]:
 
     log = RunLog.read(run / LOG)
     about = log.of_kind("run")[0]
-    settings = about["config"]["curriculum"]
+    config = about["config"]
+    agent = config["agent"]
     metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
     found = {
         "curriculum": about["curriculum"].removesuffix(MODIFIED),
-        **{key: settings.get(key, "") for key in CONDITIONS},
-        "agent": about["config"]["agent"]["_target_"].split(".")[1],
-        "seed": about["config"]["seed"],
+        **{key: _setting(config["curriculum"].get(key)) for key in OF_CURRICULUM},
+        "order": " ".join(about["tasks"]),
+        "agent": _module(agent["_target_"]),
+        "cell": cell_of(agent.get("cell")),
+        "learning_rate": agent["learning_rate"],
+        "method": _module(config["method"]["_target_"]),
         "frames": log.of_kind("evaluation")[-1]["frames"],
+        "seed": config["seed"],
+        "return": round(log.last("return_mean").mean().item(), 6),
         "success": round(log.last("success_rate").mean().item(), 6),
         "end_rate": round(log.last("end_rate").mean().item(), 6),
     }
@@ -57,73 +75,31 @@ def measured(run: Path) -> dict[str, Any]:
     return {**found, **machine_of(about)}
 
 
+def _module(target: str) -> str:
+    """Return the file of a class, such as ``ppo`` of ``baselines.ppo.PPO``."""
+    return target.split(".")[-2]
+
+
+def _setting(value: Any) -> str:
+    """Return a setting as the table has it."""
+    return "" if value is None else f"{value:g}" if isinstance(value, int | float) else str(value)
+
+
+def cell_of(cell: dict[str, Any] | None) -> str:
+    """Return the memory of an agent: its cell, and how its fast weights are modulated."""
+    if cell is None:
+        return ""
+    name = _module(cell["_target_"])
+    return f"{name}, {cell['modulation']}" if "modulation" in cell else name
+
+
 def _text(value: float | None) -> str:
     """Return a value as the table has it: nothing where it is undefined."""
     return "" if value is None or math.isnan(value) else f"{value:.6g}"
 
 
 def runs(curriculum: str, **conditions: str) -> Raw:
-    """Return the lines of a curriculum under some conditions."""
+    """Return the lines of a curriculum under some conditions, by seed."""
     lines = [line for line in read(NAME) if line["curriculum"] == curriculum]
-    return [line for line in lines if all(line[key] == value for key, value in conditions.items())]
-
-
-def difference(column: str, first: Raw, second: Raw) -> Estimate:
-    """Return the mean difference of shares of two sets of runs, paired in their order."""
-    return statistics.compare(numbers_in(first, column), numbers_in(second, column), bounds=SHARES).difference
-
-
-def above(found: Estimate) -> bool:
-    """Return whether a whole interval is above 0."""
-    return found.low is not None and found.low > 0
-
-
-def below(found: Estimate) -> bool:
-    """Return whether a whole interval is below 0."""
-    return found.high is not None and found.high < 0
-
-
-def means(column: str, lines: Raw, key: str) -> str:
-    """Return the mean of a share under each condition, such as ``1: 0.98, 2: 0.51``."""
-    of = groups(lines, key)
-    return ", ".join(f"{name}: {fmean(numbers_in(each, column)):.2f}" for (name,), each in of.items())
-
-
-def of_gradient() -> Estimate:
-    """Return the difference in success that a reward gradient makes on the large graphs."""
-    return difference(
-        "success", runs("large_gradient", reward_fn="gradient"), runs("large_gradient", reward_fn="needle")
-    )
-
-
-def of_noise(depth: str) -> Estimate:
-    """Return the difference in success that noise of standard deviation 1 makes at a depth."""
-    noisy = runs("stochastic_rewards", depth=depth, reward_std="1")
-    return difference("success", noisy, runs("stochastic_rewards", depth=depth, reward_std="0"))
-
-
-def of_negative() -> Estimate:
-    """Return the difference in episodes that reach an end state which noise of standard deviation 2 makes."""
-    noisy = runs("negative_rewards", reward_std="2")
-    return difference("end_rate", noisy, runs("negative_rewards", reward_std="0"))
-
-
-def of_groups() -> Estimate:
-    """Return the difference in tasks learned that images make which are alike within a kind of state, of four tasks."""
-    alike, apart = (numbers_in(runs("stochastic_grouped", within=within), "tasks_learned") for within in ("0.1", "0.3"))
-    return statistics.compare(alike, apart, bounds=(0, 4)).difference
-
-
-def of_dissimilar(metric: str, curriculum: str = "fo_b1_dissimilar") -> Estimate:
-    """Return the mean of a metric on tasks without similarities, or on another curriculum."""
-    return statistics.mean(numbers_in(runs(curriculum), metric))
-
-
-def of_waiting() -> Estimate:
-    """Return how many more frames later tasks need to a return of 0.9 than the first; without runs that stay below."""
-    gained: list[float | None] = []
-    for line in runs("su_b1_4tasks"):
-        later = [line[f"frames_{task}"] for task in (2, 3, 4)]
-        known = line["frames_1"] and all(later)
-        gained.append(fmean(map(float, later)) - float(line["frames_1"]) if known else None)
-    return statistics.mean(gained)
+    found = [line for line in lines if all(line[key] == value for key, value in conditions.items())]
+    return sorted(found, key=lambda line: int(line["seed"]))

@@ -1,175 +1,431 @@
-"""Sentences of the paper that can be tested: claims.md, made of raw results of other studies and of exact values."""
+"""Sentences of the paper that can be tested: claims.md, made of raw results of runs and of exact values."""
 
 from __future__ import annotations
 
+import operator
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import fmean, median
 from string import Template
 
-from ctgraph_rl.report import statistics
-from ctgraph_rl.report.statistics import Comparison
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS
 from ctgraph_rl.tasks.values import open_loop_ceiling
 from studies import claim_runs
-from studies.claim_runs import above, below
-from studies.memory.conditions import GIVEN, Condition, finished
-from studies.memory.runs import AGENTS, returns, solved
-from studies.raw import HERE, TEMPLATES, Raw, machines, shown
+from studies.claim_runs import runs
+from studies.lifelong import comparison
+from studies.memory.conditions import GIVEN, finished
+from studies.raw import HERE, TEMPLATES, Raw, groups, machines, numbers_in, read, shown, table
+from studies.verdicts import (
+    AGREES,
+    DISAGREES,
+    UNKNOWN,
+    VERDICTS,
+    Effect,
+    differences,
+    later,
+    pairs,
+    share_reached,
+    shares_later,
+    time,
+)
 
 PAGE = HERE / "claims.md"
 
-RECURRENT = [
+OF_SUCCESS = 0.25
+"""The smallest difference of a share of episodes or tasks that counts."""
+
+OF_FAILURE = 0.5
+"""The loss of success that counts as more than an agent is capable of."""
+
+OF_PAIRS = 0.5
+"""The smallest effect on times that counts: three of four pairs are later and one is earlier."""
+
+RECURRENT = (
     "lstm_ppo",
     "lstm_ppo-gru",
     "lstm_ppo-min_gru",
     "lstm_ppo-amrl_max",
     "lstm_ppo-amrl_avg",
     "lstm_ppo-backpropamine",
-]
-BASE = "lstm_ppo"
-RIVALS = {"attention": "lstm_ppo-attention", "mohqa": "mohqa", "backpropamine": "lstm_ppo-backpropamine"}
-"""Agents with attention, associative learning and neuromodulation."""
+)
 
-SHARED = [condition for condition in GIVEN if condition.unique_decisions == "False"]
-"""Confounding graphs of the paper: all decision states show one image."""
+SENTENCES = {
+    "sets": (
+        "abstract",
+        "A large observation set can produce a vast set of histories that impairs memory-augmented agents.",
+    ),
+    "gradient": (
+        "2.5",
+        "Such a setting provides a gradient across rewards in large graphs such as those in the last two rows",
+    ),
+    "noise": (
+        "2.5",
+        "their complexity is likely to exceed the capabilities of current RL algorithms, unless stochasticity is used "
+        "for very small graphs (i.e., depth 1 or 2).",
+    ),
+    "negative": (
+        "2.5",
+        "If stochasticity results in negative reward samples, a policy might be ``intimidated'' into not approaching "
+        "graph ends.",
+    ),
+    "memory": (
+        "3.2.2",
+        "Approaches such as attention, associative learning and neurmodulation are likely to provide an advantage in "
+        "this case.",
+    ),
+    "stochastic": (
+        "3.2.3",
+        "In practice, this is an extremely hard problem that links to real-world scenarios only if each subset of $O$ "
+        "share common features.",
+    ),
+    "fixed": (
+        "3.3",
+        "In all previous cases with a deterministic $\\rho$, an agent can learn to reach a specific goal state by "
+        "ignoring all inputs, and simply applying the unique and optimal sequence.",
+    ),
+    "dissimilar": (
+        "3.4.1",
+        "their lack of similarities can be exploited to test an LRL to learn new and uncorrelated tasks without "
+        "suffering from catastrophic forgetting. However, such a curriculum will not test the ability to exploit old "
+        "and new knowledge in backwards and forward transfer metrics",
+    ),
+    "waiting": ("3.4.1", "This similarity can be exploited by LRL algorithms to accelerate learning across tasks."),
+}
+"""What the paper says, by place: its words, as they are there."""
 
-FEW = "100"
-MANY = "500"
-AGREES = "agrees"
-NOT_FOUND = "not found"
-TRANSFER = "forward_transfer"
+FIRST = ("frames_1",)
+ALL = ("frames_1", "frames_2", "frames_3", "frames_4")
+LATER = ALL[1:]
+LARGE = {"16": (2, "b = 2, d = 16, p = 0.5"), "10": (3, "b = 3, d = 10, p = 0.9")}
+"""Branches, and the graph in words, by depth."""
+
+SHORT = "204800"
+NOISY = (*((depth, SHORT) for depth in "12345"), ("4", "819200"))
+"""Depths and frames of runs with noisy rewards."""
+
+SMALL = ("1", "2")
+"""Depths of very small graphs."""
+
+STDS = ("0", "1", "2", "5", "10", "30")
+
+MODULATED = "backpropamine, simple"
+PLASTIC = "backpropamine, none"
+MEMORIES = {"lstm": "an LSTM", "attention": "attention", PLASTIC: "plastic weights", MODULATED: "modulated weights"}
+OF_MEMORY = (
+    ("attention", "attention", "lstm"),
+    ("association (plastic weights)", PLASTIC, "lstm"),
+    ("neuromodulation of plastic weights", MODULATED, PLASTIC),
+)
+"""What is tested of memory: its name, its cell, and the one that it is compared with."""
 
 
-def compared_sets() -> dict[tuple[Condition, str], tuple[Raw, Raw]]:
-    """The lines of each recurrent agent with few and with many wait images, by graph with few and agent."""
+@dataclass(frozen=True)
+class Row:
+    """A sentence beside runs.
+
+    Args:
+        sentence: a key of `SENTENCES`.
+        test: what was compared.
+        number: what was found.
+        effect: in the direction of the sentence; None where the number is exact.
+        exact: the verdict on an exact number.
+    """
+
+    sentence: str
+    test: str
+    number: str
+    effect: Effect | None
+    exact: str = UNKNOWN
+
+    @property
+    def verdict(self) -> str:
+        """See `Effect.verdict`."""
+        return self.exact if self.effect is None else self.effect.verdict
+
+    @property
+    def said(self) -> str:
+        """The verdict, with its reason where nothing can be said."""
+        effect = self.effect
+        if effect is None or self.verdict != UNKNOWN:
+            return f"**{self.verdict}**"
+        if effect.room < effect.counts:
+            return f"**{UNKNOWN}**: no room for an effect"
+        return f"**{UNKNOWN}**: {len(effect.values)} seeds; {effect.seeds} would do"
+
+    def cells(self) -> list[str]:
+        """The cells of the table."""
+        number = str(list(SENTENCES).index(self.sentence) + 1)
+        if self.effect is None:
+            return [number, self.test, self.number, "exact", "exact", self.said]
+        smallest = self.effect.smallest
+        least = "none" if smallest is None else f"{smallest:.2f}"
+        return [number, self.test, self.number, shown(self.effect.estimate), least, self.said]
+
+
+def of_times(first: Raw, second: Raw, columns: Sequence[str]) -> Effect:
+    """Return the effect "the first runs are later", a value for each seed."""
+    return Effect(shares_later(first, second, columns), OF_PAIRS, share_reached(first, second, columns))
+
+
+def pairs_in_words(first: Raw, second: Raw, columns: Sequence[str]) -> str:
+    """Return how many times are later and earlier in the first runs than in the second."""
+    signs = [later(one[column], other[column]) for one, other in pairs(first, second) for column in columns]
+    return f"later in {signs.count(1)} of {len(signs)} pairs, earlier in {signs.count(-1)}"
+
+
+def frames_in_words(lines: Raw, columns: Sequence[str]) -> str:
+    """Return the median of times, where those that were not reached are the latest."""
+    middle = median(time(line[column]) for line in lines for column in columns)
+    return "not reached" if middle == float("inf") else f"{middle:,.0f}"
+
+
+def large_sets() -> list[Row]:
+    """A large set of images impairs memory."""
+    one, many = (runs("co_hard", num_wait_images=number, cell="lstm") for number in ("1", "5000"))
+    sizes = "; ".join(
+        f"{number}: {frames_in_words(runs('co_hard', num_wait_images=number, cell='lstm'), FIRST)}"
+        for number in ("1", "10", "500", "5000")
+    )
+    older = older_sets()
+    return [
+        Row(
+            "sets",
+            "5,000 wait images against one: frames to a return of 0.9, LSTM-PPO",
+            f"{pairs_in_words(many, one, FIRST)}; median by images {sizes}",
+            of_times(many, one, FIRST),
+        ),
+        Row("sets", "500 wait images against 100, six agents with memory, four graphs", *older),
+    ]
+
+
+def older_sets() -> tuple[str, Effect]:
+    """Return the comparison of 500 images with 100, a value for each agent and seed."""
     of = finished()
-    few = [condition for condition in GIVEN if condition.num_wait_images == FEW and condition.wait_prob != "0"]
-    pairs: dict[tuple[Condition, str], tuple[Raw, Raw]] = {}
+    few = [condition for condition in GIVEN if condition.num_wait_images == "100" and condition.wait_prob != "0"]
+    signs: dict[tuple[str, str], list[int]] = {}
+    reached = []
     for condition in few:
-        many = of[condition._replace(num_wait_images=MANY)]
-        pairs |= {(condition, agent): (of[condition][agent], many[agent]) for agent in RECURRENT}
-    return pairs
+        beside = of[condition._replace(num_wait_images="500")]
+        for agent in RECURRENT:
+            for one, other in pairs(of[condition][agent], beside[agent]):
+                times = (other["frames_to_90"], one["frames_to_90"])
+                signs.setdefault((agent, one["seed"]), []).append(later(*times))
+                reached.append(any(times))
+    each = [sign for found in signs.values() for sign in found]
+    words = f"later in {each.count(1)} of {len(each)} pairs, earlier in {each.count(-1)}"
+    return words, Effect([fmean(found) for found in signs.values()], OF_PAIRS, fmean(reached))
 
 
-def of_large_sets() -> Comparison:
-    """Greedy returns with many wait images against those with few, paired by graph, agent and seed."""
-    pairs = compared_sets().values()
-    many = [value for _, lines in pairs for value in returns(lines)]
-    few = [value for lines, _ in pairs for value in returns(lines)]
-    return statistics.compare(many, few, bounds=(0, 1))
+def gradients() -> list[Row]:
+    """A reward gradient helps on large graphs."""
+    found = []
+    for depth, (branches, graph) in LARGE.items():
+        gradient, needle = (runs("guided_gradient", depth=depth, reward_fn=name) for name in ("gradient", "needle"))
+        if not gradient:
+            found.append(without_guide(depth, graph))
+        else:
+            ends = [fmean(numbers_in(lines, "end_rate")) for lines in (gradient, needle)]
+            reached = Effect(differences(gradient, needle, "end_rate"), OF_SUCCESS, 1 - ends[1])
+            number = f"episodes at an end {ends[0]:.2f} and {ends[1]:.2f}"
+            found.append(Row("gradient", f"gradient against one goal, PPO, {graph}", number, reached))
+            returns = numbers_in(gradient, "return")
+            chance = return_of_random_ends(gradient[0]["order"], branches)
+            values = [value - chance for value in returns]
+            near = Effect(values, OF_SUCCESS, 1 - chance, (-chance, 1 - chance))
+            test = f"return less that of random ends, {chance:.2f}, PPO with the gradient, {graph}"
+            found.append(Row("gradient", test, f"return {fmean(returns):.2f}", near))
+    return found
 
 
-def large_sets() -> dict[str, str]:
-    """What the page says of large sets of observations."""
-    pairs = compared_sets()
-    changes = {key: sum(solved(many)) - sum(solved(few)) for key, (few, many) in pairs.items()}
-    lost, won = (sum(abs(each) for each in changes.values() if sign * each > 0) for sign in (-1, 1))
-    found = of_large_sets().difference
-    return {
-        "sets_few": str(sum(sum(solved(few)) for few, _ in pairs.values())),
-        "sets_many": str(sum(sum(solved(many)) for _, many in pairs.values())),
-        "sets_runs": str(sum(len(few) for few, _ in pairs.values())),
-        "sets_difference": shown(found),
-        "sets_lost": str(lost),
-        "sets_won": str(won),
-        "sets_worst": str(-min(changes.values())),
-        "sets_verdict": AGREES if below(found) else NOT_FOUND,
+def without_guide(depth: str, graph: str) -> Row:
+    """The row of a graph without guided runs: no run met an end, so no effect was possible."""
+    gradient, needle = (runs("large_gradient", depth=depth, reward_fn=name) for name in ("gradient", "needle"))
+    met = max(numbers_in(gradient + needle, "end_rate"))
+    effect = Effect(differences(gradient, needle, "end_rate"), OF_SUCCESS, met)
+    return Row("gradient", f"the same without a guide, PPO, {graph}", f"episodes at an end {met:.2f}", effect)
+
+
+def return_of_random_ends(goal: str, branches: int) -> float:
+    """Return the mean of a reward gradient over all ends, for a goal such as ``goal1.2``; exact."""
+    right = [int(place) for place in goal.removeprefix("goal").split(".")]
+    misses = [fmean(abs(branch - place) for branch in range(1, branches + 1)) for place in right]
+    weights = [branches ** (len(right) - k) for k in range(1, len(right) + 1)]
+    return 1 - sum(map(operator.mul, weights, misses)) / (branches ** len(right) - 1)
+
+
+def noise() -> list[Row]:
+    """Noisy rewards are beyond agents from depth 3 on."""
+    rows = []
+    for depth, frames in NOISY:
+        plain = runs("stochastic_rewards", depth=depth, reward_std="0", frames=SHORT)
+        noisy = runs("stochastic_rewards", depth=depth, reward_std="1", frames=frames)
+        success = [fmean(numbers_in(lines, "success")) for lines in (noisy, plain)]
+        effect = Effect(differences(plain, noisy, "success"), OF_FAILURE, success[1], absent=depth in SMALL)
+        test = f"noise of standard deviation 1 against none, PPO, depth {depth}"
+        if frames != SHORT:
+            test += f", {int(frames):,} frames with noise"
+        rows.append(Row("noise", test, f"success {success[0]:.2f} and {success[1]:.2f}", effect))
+    return rows
+
+
+def negative_samples() -> list[Row]:
+    """Negative samples keep a policy from ends."""
+    ends = {std: numbers_in(runs("negative_rewards", reward_std=std, goal_reward="1"), "end_rate") for std in STDS}
+    control = fmean(numbers_in(runs("negative_rewards", goal_reward="-1"), "end_rate"))
+    plain = runs("negative_rewards", reward_std="0", goal_reward="1")
+    noisy = runs("negative_rewards", reward_std=STDS[-1], goal_reward="1")
+    rates = ", ".join(f"{std}: {fmean(values):.2f}" for std, values in ends.items())
+    number = f"episodes at an end by standard deviation {rates}; control {control:.2f}"
+    effect = Effect(differences(plain, noisy, "end_rate"), OF_SUCCESS, fmean(ends["0"]) - control)
+    test = f"noise of standard deviation {STDS[-1]} against none, PPO, CT-FO-B1"
+    return [Row("negative", test, number, effect)]
+
+
+def advantages() -> list[Row]:
+    """Attention, association and neuromodulation are an advantage."""
+    rows = []
+    for name, cell, other in OF_MEMORY:
+        lines = tested(cell)
+        beside = [line for line in tested(other) if line["seed"] in {line["seed"] for line in lines}]
+        medians = f"medians {frames_in_words(lines, FIRST)} and {frames_in_words(beside, FIRST)}"
+        number = f"the other is {pairs_in_words(beside, lines, FIRST)}; {medians}"
+        test = f"{name} against {MEMORIES[other]}, frames to 0.9"
+        rows.append(Row("memory", test, number, of_times(beside, lines, FIRST)))
+    return rows
+
+
+def tested(cell: str) -> Raw:
+    """Return the runs of a memory that are not of the search over its settings."""
+    lines = runs("co_hard", num_wait_images="500", cell=cell)
+    return [line for line in lines if int(line["seed"]) < 100]
+
+
+def stochastic_observations() -> list[Row]:
+    """Fully stochastic observations are hard unless those of one kind share features."""
+    rows = []
+    for size in ("10", "50", "200"):
+        alike, apart = (
+            runs("stochastic_grouped", group_size=size, within=within, frames="204800") for within in ("0.1", "0.3")
+        )
+        learned = [fmean(numbers_in(lines, "tasks_learned")) for lines in (alike, apart)]
+        gained = [value / 4 for value in differences(alike, apart, "tasks_learned")]
+        effect = Effect(gained, OF_SUCCESS, 1 - learned[1] / 4)
+        number = f"{learned[0]:.1f} and {learned[1]:.1f} of 4 tasks learned"
+        rows.append(Row("stochastic", f"sets of {size}, alike against unrelated, LSTM-PPO", number, effect))
+    return rows
+
+
+def open_loop() -> list[Row]:
+    """With p = 0 an agent can ignore all inputs."""
+    ceilings = {name: (make().graph.wait_prob > 0, open_loop_ceiling(make())) for name, make in CONFIGURATIONS.items()}
+    agrees = all((best < 1) is waits for waits, best in ceilings.values())
+    number = ", ".join(f"{name} {best:g}" for name, (_, best) in sorted(ceilings.items(), key=lambda each: each[1][0]))
+    test = "return of the best fixed sequence of actions"
+    return [Row("fixed", test, number, None, AGREES if agrees else DISAGREES)]
+
+
+def similarity() -> list[Row]:
+    """Tasks without similarities test forgetting, and not transfer."""
+    tuned, scratch = (runs("fo_b1_dissimilar", method=method, frames="409600") for method in ("finetune", "scratch"))
+    nested = [nested_goals(method) for method in ("scratch", "finetune")]
+    control = of_times(*nested, LATER)
+    forgotten = numbers_in(tuned, "forgetting")
+    room = 1.0 if control.verdict == AGREES else 0.0
+    transfer = Effect(shares_later(scratch, tuned, LATER), OF_PAIRS, room, absent=True)
+    number = f"scratch is {pairs_in_words(scratch, tuned, LATER)}; on nested goals, the control, "
+    return [
+        Row(
+            "dissimilar",
+            "forgetting of fine-tuned PPO",
+            f"{fmean(forgotten):.2f}",
+            Effect(forgotten, OF_SUCCESS, 1.0),
+        ),
+        Row(
+            "dissimilar",
+            "transfer to later tasks: `scratch` against fine-tuning, PPO",
+            number + pairs_in_words(*nested, LATER),
+            transfer,
+        ),
+    ]
+
+
+def nested_goals(method: str) -> Raw:
+    """Return the times of PPO on growing depth, a line for each seed, from the table of methods."""
+    from ctgraph_rl.metrics.curves import frames_to_mastery
+
+    lines = [line for line in read("methods") if (line["agent"], line["curriculum"]) == ("ppo", "fo_b1_depth2to5")]
+    found = []
+    for (seed,), of in groups([line for line in lines if line["method"] == method], "seed").items():
+        terms = frames_to_mastery(comparison.curves(of)).terms or []
+        times = ["" if term is None else f"{term:g}" for term in terms]
+        found.append({"seed": seed, **dict(zip(ALL, times, strict=True))})
+    return sorted(found, key=lambda line: int(line["seed"]))
+
+
+def waiting() -> list[Row]:
+    """Shared waiting accelerates learning."""
+    scratch = runs("shared_waiting", method="scratch")
+    rows = []
+    for method in ("finetune", "clear", "mask_lc"):
+        lines = runs("shared_waiting", method=method)
+        number = f"{pairs_in_words(scratch, lines, LATER)} from scratch"
+        rows.append(
+            Row("waiting", f"`scratch` against `{method}`, later tasks", number, of_times(scratch, lines, LATER))
+        )
+    return rows
+
+
+def rows() -> list[Row]:
+    """All rows of the table, in the order of the paper."""
+    parts = (
+        large_sets,
+        gradients,
+        noise,
+        negative_samples,
+        advantages,
+        stochastic_observations,
+        open_loop,
+        similarity,
+        waiting,
+    )
+    return [row for part in parts for row in part()]
+
+
+def summary(found: Sequence[Row]) -> str:
+    """Return the sentences with the verdicts of their rows."""
+    lines = []
+    for number, (sentence, (place, words)) in enumerate(SENTENCES.items(), start=1):
+        verdicts = [row.verdict for row in found if row.sentence == sentence]
+        counts = [f"{name} {verdicts.count(name)}" for name in VERDICTS if name in verdicts]
+        lines.append(f'{number}. {place}: "{words}" **{", ".join(counts)}**')
+    return "\n".join(lines)
+
+
+def settings() -> str:
+    """Return the learning rate of each memory."""
+    rates = {
+        cell: {line["learning_rate"] for line in tested(cell)} for cell in ("lstm", "attention", PLASTIC, MODULATED)
     }
-
-
-def of_rival(name: str) -> tuple[Raw, Comparison]:
-    """The lines of an agent on all graphs with shared decisions, and its returns against those of the LSTM."""
-    of = finished()
-    lines, base = ([line for each in SHARED for line in of[each][agent]] for agent in (name, BASE))
-    return lines, statistics.compare(returns(lines), returns(base), bounds=(0, 1))
-
-
-def advantages() -> dict[str, str]:
-    """What the page says of attention, associative learning and neuromodulation on confounding graphs."""
-    base, _ = of_rival(BASE)
-    said = {"lstm": f"{sum(solved(base))} of {len(base)}"}
-    better = []
-    for key, name in RIVALS.items():
-        lines, found = of_rival(name)
-        better.append(above(found.difference))
-        said |= {key: f"{sum(solved(lines))} of {len(lines)}", f"{key}_difference": shown(found.difference)}
-    return said | {"advantage_verdict": AGREES if all(better) else NOT_FOUND}
-
-
-def open_loop() -> dict[str, str]:
-    """What the page says of sequences of actions that ignore all observations; exact."""
-    ceilings = {name: open_loop_ceiling(make()) for name, make in CONFIGURATIONS.items()}
-    waits = {name: make().graph.wait_prob > 0 for name, make in CONFIGURATIONS.items()}
-    without, withs = ([f"{name} {ceilings[name]:g}" for name in waits if waits[name] is p] for p in (False, True))
-    holds = all((ceilings[name] < 1) is waits[name] for name in waits)
-    verdict = AGREES if holds else NOT_FOUND
-    return {"no_waits": ", ".join(without), "with_waits": ", ".join(withs), "open_loop_verdict": verdict}
-
-
-def gradients() -> dict[str, str]:
-    """What the page says of reward gradients on large graphs."""
-    found = claim_runs.of_gradient()
-    said = {"gradient_difference": shown(found), "gradient_verdict": AGREES if above(found) else NOT_FOUND}
-    for name in ("gradient", "needle"):
-        lines = claim_runs.runs("large_gradient", reward_fn=name)
-        said[f"success_{name}"] = claim_runs.means("success", lines, "depth")
-    return said
-
-
-def noise() -> dict[str, str]:
-    """What the page says of noisy rewards."""
-    deep = claim_runs.of_noise("3")
-    deeper = claim_runs.of_noise("4")
-    ends = claim_runs.of_negative()
-    noisy = claim_runs.runs("stochastic_rewards", reward_std="1")
-    return {
-        "noise_difference": shown(deep),
-        "deeper_difference": shown(deeper),
-        "noise_success": claim_runs.means("success", noisy, "depth"),
-        "noise_verdict": AGREES if below(deep) and below(deeper) else NOT_FOUND,
-        "ends_difference": shown(ends),
-        "ends_rates": claim_runs.means("end_rate", claim_runs.runs("negative_rewards"), "reward_std"),
-        "ends_verdict": AGREES if below(ends) else NOT_FOUND,
-    }
-
-
-def alike() -> dict[str, str]:
-    """What the page says of images that are alike within a kind of state."""
-    found = claim_runs.of_groups()
-    rates = claim_runs.means("tasks_learned", claim_runs.runs("stochastic_grouped"), "within")
-    return {
-        "alike_difference": shown(found),
-        "alike_rates": rates,
-        "alike_verdict": AGREES if above(found) else NOT_FOUND,
-    }
-
-
-def similarity() -> dict[str, str]:
-    """What the page says of tasks without similarities, and of the wait states that tasks share."""
-    forgetting = claim_runs.of_dissimilar("forgetting")
-    transfer = claim_runs.of_dissimilar(TRANSFER)
-    waiting = claim_runs.of_waiting()
-    return {
-        "dissimilar_forgetting": shown(forgetting),
-        "dissimilar_transfer": shown(transfer),
-        "similar_transfer": shown(claim_runs.of_dissimilar(TRANSFER, "fo_b1_4tasks")),
-        "dissimilar_verdict": AGREES if above(forgetting) and not above(transfer) else NOT_FOUND,
-        "waiting_difference": shown(waiting),
-        "waiting_verdict": AGREES if below(waiting) else NOT_FOUND,
-    }
+    return ", ".join(f"{cell} {', '.join(sorted(found))}" for cell, found in rates.items())
 
 
 def page() -> str:
-    """The page: its template with its numbers."""
+    """The page: its template with its table and numbers."""
     text = (TEMPLATES / "claims.md").read_text(encoding="utf-8")
-    parts = (large_sets, advantages, open_loop, gradients, noise, alike, similarity)
-    found: dict[str, str] = {}
-    for part in parts:
-        found |= part()
-    verdicts = [value for name, value in found.items() if name.endswith("_verdict")]
+    found = rows()
+    verdicts = [row.verdict for row in found]
+    head = ["sentence", "test", "found", "effect", "smallest effect seen", "verdict"]
     return Template(text).substitute(
-        found,
-        agents=", ".join(AGENTS[name] for name in RECURRENT),
+        summary=summary(found),
+        table=table(head, [row.cells() for row in found]),
+        num_tests=len(found),
         num_agrees=verdicts.count(AGREES),
-        num_not_found=verdicts.count(NOT_FOUND),
+        num_disagrees=verdicts.count(DISAGREES),
+        num_unknown=verdicts.count(UNKNOWN),
+        of_success=OF_SUCCESS,
+        of_failure=OF_FAILURE,
+        of_pairs=OF_PAIRS,
+        settings=settings(),
         machines=machines("memory_cells", claim_runs.NAME),
     )
 

@@ -28,15 +28,14 @@ TABLES = {
         Table("collective_blocks", ("final_return",), ("num_members", "exchange")),
         Table("selecting", ("evaluated",), ("method",)),
     ],
-}
-LONG = {
     "studies.lifelong.conclusions": [
         Table(folder + name, RETURNS[: 12 if name == "masks_ct12" else 8], ("method",))
         for name in ("masks_ct8", "masks_ct12", "masks_ct8_md")
         for folder in ("", "epochs/")
     ],
 }
-"""Pages of long tables."""
+QUICK = "studies.collectives.conclusions"
+PAGES = [pytest.param(page, marks=() if page == QUICK else pytest.mark.slow) for page in TABLES]
 
 
 def not_said(sentences: Sentences) -> set[str]:
@@ -51,12 +50,12 @@ def not_said(sentences: Sentences) -> set[str]:
     return found
 
 
-@pytest.mark.parametrize("page", [*TABLES, *(pytest.param(page, marks=pytest.mark.slow) for page in LONG)])
+@pytest.mark.parametrize("page", PAGES)
 def test_what_a_page_concludes_is_not_said_of_opposite_or_empty_results(page, tmp_path, monkeypatch):
     says = import_module(page).says
     found = {}
     for change in (mirror, shuffle, empty):
-        write_changed({**TABLES, **LONG}[page], change, tmp_path / change.__name__)
+        write_changed(TABLES[page], change, tmp_path / change.__name__)
         with monkeypatch.context() as patch:
             patch.setattr(raw, "HERE", tmp_path / change.__name__)
             found[change] = not_said(says)
