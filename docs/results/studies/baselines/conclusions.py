@@ -29,13 +29,15 @@ def _() -> bool:
 
 @says("Without memory, agents reach the exact limit of policies without memory, and no more.")
 def _() -> bool:
-    from studies.baselines.page import task_of
+    from ctgraph_rl.tasks.configurations import CONFIGURATIONS
 
     cells = groups(read("baselines_b1"), "configuration", "task", "agent")
     away = []
     for (configuration, goal, agent), lines in cells.items():
         if agent in WITHOUT_MEMORY:
-            limit = task_of(configuration, goal).memoryless_ceiling(deterministic=True)
+            make = CONFIGURATIONS["CT-" + configuration.upper().replace("_", "-")]
+            task = make(goal=tuple(map(int, goal.split("."))))
+            limit = task.memoryless_ceiling(deterministic=True)
             away.append(abs(fmean(numbers_in(lines, "greedy_return")) - limit))
     return len(away) == 48 and max(away) < NEAR
 

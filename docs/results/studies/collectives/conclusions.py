@@ -5,7 +5,8 @@ from __future__ import annotations
 from itertools import pairwise
 from statistics import fmean
 
-from studies.collectives import mosaic, page, selecting
+from studies.collectives import mosaic, selecting
+from studies.collectives.l2d2c import new_and_known, on_l2d2c
 from studies.raw import groups, numbers_in, read
 from studies.sentences import Sentences
 
@@ -17,11 +18,11 @@ says = Sentences()
     "The gain comes from members who had the task before."
 )
 def _() -> bool:
-    returns = [numbers_in(page.on_l2d2c(number), "final_return") for number in ("1", "4", "16")]
+    returns = [numbers_in(on_l2d2c(number), "final_return") for number in ("1", "4", "16")]
     apart = all(max(fewer) < min(more) for fewer, more in pairwise(returns))
     gains = []
     for number in ("4", "16"):
-        new, known = (fmean(numbers_in(lines, "final_return")) for lines in page.new_and_known(number))
+        new, known = (fmean(numbers_in(lines, "final_return")) for lines in new_and_known(number))
         gains.append(known - new > new - fmean(returns[0]))
     return apart and all(gains)
 

@@ -8,6 +8,8 @@ from string import Template
 from typing import TYPE_CHECKING, Any
 
 from studies.collectives import mosaic, selecting
+from studies.collectives.conclusions import says
+from studies.collectives.l2d2c import FRAMES, new_and_known, on_l2d2c
 from studies.collectives.runs import BLOCKS, CELL, KEY, NAME
 from studies.raw import HERE, TEMPLATES, Raw, groups, machines, mean_of, numbers_in, read, shown, table
 from studies.two_groups import two_groups
@@ -17,8 +19,8 @@ SEEDS = 5
 if TYPE_CHECKING:
     from ctgraph_rl.report.statistics import Estimate
 
-FRAMES, LONGER = "12800", "25600"
-"""Frames of a block of l2d2c_16x16, and of the run alone that has twice as many."""
+LONGER = "25600"
+"""Frames of a block of the run alone that has twice as many."""
 
 NUMBERS = ("1", "4", "16")
 """Members of the collectives of l2d2c_16x16."""
@@ -30,16 +32,6 @@ BATCH = 1_280
 """Frames of a batch: the least time."""
 
 DPI = 220
-
-
-def cells() -> dict[tuple[str, ...], Raw]:
-    """Lines of collectives by the columns of `CELL`."""
-    return groups(read(NAME), *CELL)
-
-
-def on_l2d2c(num_members: str, frames: str = FRAMES, num_epochs: str = "1") -> Raw:
-    """Lines of the collectives of l2d2c_16x16 with as many members."""
-    return cells().get(("l2d2c_16x16", frames, "l2d2c", num_members, num_epochs), [])
 
 
 def solving_times(num_members: str, frames: str = FRAMES, num_epochs: str = "1") -> list[float]:
@@ -180,24 +172,8 @@ def page() -> str:
     first, *_, last = by_block("16", "8")[1:]
     texts |= {"second": f"{first:.2f}", "last": f"{last:.2f}"}
     texts |= mosaic.texts() | selecting.texts()
-    from studies.collectives.conclusions import says
-
     made = template.substitute(l2d2c=l2d2c_table(), machines=machines(NAME, selecting.NAME), not_run=not_run(), **texts)
     return says.check(made)
-
-
-def new_and_known(num_members: str) -> tuple[Raw, Raw]:
-    """Return the blocks whose task no member had in an earlier block, and the others."""
-    lines = groups(read(BLOCKS), *CELL)["l2d2c_16x16", FRAMES, "l2d2c", num_members, "1"]
-    first: dict[tuple[str, str], int] = {}
-    for line in lines:
-        key = (line["seed"], line["task"])
-        first[key] = min(int(line["block"]), first.get(key, int(line["block"])))
-    new: Raw = []
-    known: Raw = []
-    for line in lines:
-        (known if int(line["block"]) > first[line["seed"], line["task"]] else new).append(line)
-    return new, known
 
 
 def known_and_new(num_members: str) -> dict[str, str]:
