@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
 from string import Template
@@ -174,10 +175,15 @@ def _ranks(of: BoardTable) -> dict[str, set[str]]:
     return found
 
 
+def _mean(values: Sequence[float | None]) -> float:
+    """Return the mean of seeds, of which each has a value."""
+    return fmean(value for value in values if value is not None)
+
+
 @says("Ten keep nearly everything. 20 seeds cannot order them:")
 def _(tables: list[BoardTable]) -> bool:
     first = [line for line in tables[0].standings if line.rank == "1 to 10"]
-    forgotten = [fmean(line.entry.values["forgetting"]) for line in first]
+    forgotten = [_mean(line.entry.values["forgetting"]) for line in first]
     return tables[0].num_seeds == 20 and len(first) == 10 and max(forgotten) < 0.05
 
 
@@ -191,7 +197,7 @@ def _(tables: list[BoardTable]) -> bool:
 @says("MaskSC, which forgets nothing but does not learn every task,")
 def _(tables: list[BoardTable]) -> bool:
     [line] = [line for line in tables[0].standings if line.name == "PPO + MaskSC"]
-    return set(line.entry.values["forgetting"]) == {0.0} and fmean(line.entry.scores) < 0.95
+    return set(line.entry.values["forgetting"]) == {0.0} and _mean(line.entry.scores) < 0.95
 
 
 def _without(there: set[str]) -> str:

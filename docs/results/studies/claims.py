@@ -327,8 +327,9 @@ def open_loop() -> list[Row]:
 def similarity() -> list[Row]:
     """Tasks without similarities test forgetting, and not transfer."""
     tuned, scratch = (runs("fo_b1_dissimilar", method=method, frames="409600") for method in ("finetune", "scratch"))
-    nested = [nested_goals(method) for method in ("scratch", "finetune")]
-    control = of_times(*nested, LATER)
+    nested_scratch = nested_goals("scratch")
+    nested_tuned = nested_goals("finetune")
+    control = of_times(nested_scratch, nested_tuned, LATER)
     forgotten = numbers_in(tuned, "forgetting")
     room = 1.0 if control.verdict == AGREES else 0.0
     transfer = Effect(shares_later(scratch, tuned, LATER), OF_PAIRS, room, absent=True)
@@ -343,7 +344,7 @@ def similarity() -> list[Row]:
         Row(
             "dissimilar",
             "transfer to later tasks: `scratch` against fine-tuning, PPO",
-            number + pairs_in_words(*nested, LATER),
+            number + pairs_in_words(nested_scratch, nested_tuned, LATER),
             transfer,
         ),
     ]
@@ -356,7 +357,7 @@ def nested_goals(method: str) -> Raw:
     lines = [line for line in read("methods") if (line["agent"], line["curriculum"]) == ("ppo", "fo_b1_depth2to5")]
     found = []
     for (seed,), of in groups([line for line in lines if line["method"] == method], "seed").items():
-        terms = frames_to_mastery(comparison.curves(of)).terms or []
+        terms: Sequence[float | None] = frames_to_mastery(comparison.curves(of)).terms or ()
         times = ["" if term is None else f"{term:g}" for term in terms]
         found.append({"seed": seed, **dict(zip(ALL, times, strict=True))})
     return sorted(found, key=lambda line: int(line["seed"]))

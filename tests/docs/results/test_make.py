@@ -40,7 +40,10 @@ def test_without_a_name_all_pages_are_made_and_with_one_that_page_is(monkeypatch
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["baselines_b1", "runs", "--add"], "--add is for masks_ct8_md, masks_ct8, masks_ct12, methods, collectives, "),
+        (
+            ["baselines_b1", "runs", "--add"],
+            "--add is for masks_ct8_md, masks_ct8, masks_ct12, methods, claim_runs, ",
+        ),
         (["together_fo_b1", "runs"], "needs two folders, of the runs alone and of those together, got 1"),
         (["collectives", "none"], "no finished run of collectives, collective_blocks, selecting, whose files stay as "),
         (["no_labels", "none"], "no finished run of no_labels, no_labels_spans, whose files stay as they were"),
