@@ -17,7 +17,7 @@ TRANSFER = ("forward_transfer", "backward_transfer")
 
 WHERE_KNOWN = (
     "isolated_forgetting",
-    *("first_success", "held_out_adapted_return", "held_out_search_regret"),
+    *("held_out_adapted_return", "held_out_search_regret"),
     *(metric.__name__ for metric in metrics.AGAINST_EXPERTS),
     *("continual_world_forward_transfer", "forward_transfer_from_experts", "memory_gap_closed"),
 )
