@@ -77,14 +77,20 @@ def bounds_by_curriculum(runs: Sequence[Run]) -> dict[str, BoundsOfRuns]:
 
 
 def bounds_of(runs: Iterable[Run]) -> BoundsOfRuns:
-    """Return the bounds of runs of one curriculum, from the first of them of which the curriculum is known."""
+    """Return the bounds of runs of one curriculum, from the first of them of which the curriculum is known.
+
+    Sums over time have those of the run with the most evaluations: the first one may be unfinished.
+    """
+    curriculum: Curriculum | None = None
+    evaluations = 1
     for run in runs:
-        curriculum = curriculum_of(run)
-        if curriculum is not None and run.history is not None:
-            curves = run.history.evaluations.values()
-            evaluations = max((sum(frames > 0 for frames, _ in curve) for curve in curves), default=1)
-            return bounds_of_curriculum(curriculum, evaluations)
-    return NO_BOUNDS
+        if run.history is None:
+            continue
+        if curriculum is None:
+            curriculum = curriculum_of(run)
+        for curve in run.history.evaluations.values():
+            evaluations = max(evaluations, sum(frames > 0 for frames, _ in curve))
+    return NO_BOUNDS if curriculum is None else bounds_of_curriculum(curriculum, evaluations)
 
 
 def bounds_of_curriculum(curriculum: Curriculum, evaluations: int = 1) -> BoundsOfRuns:

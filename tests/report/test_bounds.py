@@ -148,6 +148,16 @@ def test_of_another_curriculum_than_the_run_learned_nothing_is_known(tmp_path):
     assert bounds_of(runs).of_metric("of_another_version") == UNBOUNDED
 
 
+def test_a_first_run_that_is_unfinished_does_not_bound_sums_over_time_by_its_few_evaluations(tmp_path):
+    runs = of_known_curriculum(tmp_path, (1.0, 1.0))
+    curves = {label: [(0, 0.0), (204_800, 1.0)] for label in runs[0].history.labels}
+    unfinished = replace(runs[0], history=runs[0].history._replace(evaluations=curves))
+
+    bounds = bounds_of([unfinished, runs[1]])
+
+    assert bounds.of_metric("total_performance_over_time") == Bounds(0, 16)  # four tasks, four evaluations
+
+
 def test_a_time_is_a_median_that_seeds_that_never_got_there_count_in(tmp_path):
     runs = of_known_curriculum(tmp_path, (1.0, 1.0, 1.0))
     for run, (value, never) in zip(runs, ((2.0, 0), (None, 1), (4.0, 0)), strict=True):
