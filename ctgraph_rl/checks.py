@@ -157,7 +157,9 @@ def _plain(value: Any, whole: bool) -> Any:
     if kind is dict:
         return {key: _plain(item, whole) for key, item in value.items()}
     if hasattr(kind, "tolist"):
-        return _plain(value.tolist(), whole)
+        listed = value.tolist()
+        if type(listed) is not kind:  # NumPy's longdouble returns itself
+            return _plain(listed, whole)
     if hasattr(kind, "__index__"):
         return operator.index(value)
     if not hasattr(kind, "__float__"):

@@ -137,7 +137,7 @@ def test_a_number_may_be_of_numpy_torch_or_decimal_and_is_no_bool(name, number):
     value = numbers[number]
     of_numpy = np.int64(value) if isinstance(value, int) else np.float64(value)
 
-    for other in (of_numpy, np.array(value), torch.tensor(value), Decimal(value)):
+    for other in (of_numpy, np.longdouble(value), np.array(value), torch.tensor(value), Decimal(value)):
         call(**numbers | {number: other})
     for other in (True, np.True_, torch.tensor(True)):
         with pytest.raises(ValueError, match=number):

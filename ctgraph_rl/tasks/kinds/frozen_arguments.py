@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import plain, require
 
 
 class ListArgument(tuple[Any, ...]):
@@ -48,8 +48,9 @@ def freeze(value: Any) -> Any:
 
 
 def _key(key: Any) -> Any:
-    plain = key is None or isinstance(key, (bool, int, float, str))
-    require((plain, f"the key {key!r:.80} of a dict is no number or text"))
+    key = plain(key)
+    known = key is None or isinstance(key, (bool, int, float, str))
+    require((known, f"the key {key!r:.80} of a dict is no number or text"))
     return key
 
 

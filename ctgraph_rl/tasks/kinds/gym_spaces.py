@@ -190,7 +190,7 @@ class ActionForm:
     def give(self, action: Any) -> Any:
         """Return an action of a row as the environment takes it: in the space's own numbers, a copy."""
         if self.num_actions is not None:
-            return np.int64(action) + int(self.space.start)
+            return self.space.dtype.type(int(action) + int(self.space.start))
         dtype = self.space.dtype
         if dtype.kind in "iub":
             return np.rint(action).astype(dtype)
@@ -250,7 +250,7 @@ def _as_array(value: Any) -> NDArray[Any]:
 
 
 def _check_finite(array: NDArray[Any]) -> None:
-    wrong = ~(np.abs(array) <= LARGEST)
+    wrong = ~(np.abs(array).astype(np.float64) <= LARGEST)  # LARGEST is infinite as float16
     if wrong.any():
         [place] = np.argwhere(wrong)[:1].tolist()
         value = array[tuple(place)]

@@ -110,6 +110,7 @@ def test_arguments_of_different_types_make_different_tasks():
     assert len({of(task).fingerprint for task in everything}) == len(everything)
     assert [Curriculum.from_json(of(task).to_json()).tasks[0] for task in everything] == everything
     assert tasks[1] == GymTask("arguments/Keeps-v0", {"x": np.int64(1)})
+    assert tasks[11] == GymTask("arguments/Keeps-v0", {"x": {np.int64(1): np.int64(1)}})
     assert hash(tasks[1]) == hash(GymTask("arguments/Keeps-v0", {"x": 1}))
 
 

@@ -55,6 +55,7 @@ def played(task, num_steps=4):
 
 NUMBERS = {
     "Plain": (1, [1, 2, 3], False),
+    "Long": (np.longdouble(1), np.array([1, 2, 3], np.longdouble), np.bool_(False)),
     "Numpy": (np.float32(1), np.array([1, 2, 3]), np.bool_(False)),
     "Arrays": (np.array([1.0]), np.array([[1, 2, 3]]), np.array([False])),
     "Torch": (torch.ones(1, requires_grad=True), torch.tensor([1.0, 2.0, 3.0], requires_grad=True), torch.zeros(())),
@@ -128,6 +129,24 @@ def test_an_action_is_given_in_the_space_s_own_numbers_and_is_the_environment_s_
     assert step["next", "reward"].item() == pytest.approx(0.1)
     assert after.equal(most)
     assert other._actions[0][0].tolist() == most[0].tolist()
+
+
+def test_an_integer_action_has_the_dtype_of_its_space():
+    taken = []
+
+    class Short(Returns):
+        action_space = Discrete(2, start=3, dtype=np.int32)
+
+        def step(self, action):
+            assert action in self.action_space
+            taken.append(action)
+            return super().step(action)
+
+    gymnasium.register("returns/Short-v0", Short, max_episode_steps=4)
+
+    GymEnv([GymTask("returns/Short-v0")]).rollout(4)
+
+    assert {type(action) for action in taken} == {np.int32}
 
 
 def test_each_row_reads_integers_from_its_own_space():
@@ -209,6 +228,14 @@ def test_what_is_not_finite_is_named_with_environment_task_and_frame(what, value
     place = rf"returns/Breaks-v0 \(mine\): {said}.* \(frame 45, step 23 of an episode with seed \d+\)"
     with pytest.raises(FloatingPointError, match=place):
         env.rollout(30)
+
+
+def test_an_infinite_number_of_16_bits_is_not_finite():
+    half = Box(-np.inf, np.inf, (3,), np.float16)
+    task = task_of("Half", observation_space=half, observation=np.array([0, np.inf, 0], np.float16))
+
+    with pytest.raises(FloatingPointError, match=r"the observation is inf at \[1\]"):
+        GymEnv([task])
 
 
 def test_a_resumed_environment_counts_its_frames_on():
