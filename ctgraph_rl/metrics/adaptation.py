@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ctgraph_rl.metrics.bounds import not_negative, of_performance
+from ctgraph_rl.metrics.bounds import not_negative, of_performance, of_search_regret
 from ctgraph_rl.metrics.record import HERE, defined
 
 
@@ -58,7 +58,12 @@ def held_out_adapted_return(adaptation: Adaptation) -> Tensor:
     return adaptation.returns[:, -1]
 
 
-@defined("ctgraph_rl/search-regret", "1/T sum_j sum_i (min(1, i/n_j) - success_j in episode i of rows)", HERE)
+@defined(
+    "ctgraph_rl/search-regret",
+    "1/T sum_j sum_i (min(1, i/n_j) - success_j in episode i of rows)",
+    HERE,
+    bounds=of_search_regret,
+)
 def search_regret(adaptation: Adaptation) -> Tensor:
     """Return the goals that a row misses beside the best search: the area between its curve and the exact one.
 
@@ -72,6 +77,7 @@ def search_regret(adaptation: Adaptation) -> Tensor:
     "as search-regret, over held-out tasks",
     HERE,
     inputs={"adaptation": "held_out_adaptation"},
+    bounds=of_search_regret,
 )
 def held_out_search_regret(adaptation: Adaptation) -> Tensor:
     """Return the same on held-out tasks."""

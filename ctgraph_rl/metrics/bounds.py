@@ -19,6 +19,8 @@ class Known(NamedTuple):
     evaluations: int  # of each task, after those before training
     lowest_share: float = -math.inf  # lowest of (return - failure) / (optimum - failure) of any task's evaluation
     highest_share: float = math.inf  # highest one: 1 where no evaluation is better than the optimum
+    lowest_search_regret: float = -math.inf  # of a row of any task, that reaches the goal in all its episodes
+    highest_search_regret: float = math.inf  # of one that never reaches it
 
 
 LowAndHigh = tuple[float, float]
@@ -44,6 +46,11 @@ def at_most_1(known: Known) -> LowAndHigh:
 def of_regret(known: Known) -> LowAndHigh:
     """Return the bounds of what is lost against the optimum; chance may gain something, where an episode can."""
     return 0.0 if known.highest_share <= 1 else -math.inf, math.inf
+
+
+def of_search_regret(known: Known) -> LowAndHigh:
+    """Return the bounds of the goals that a row misses beside the best search."""
+    return known.lowest_search_regret, known.highest_search_regret
 
 
 def between(low: float, high: float) -> BoundsOf:

@@ -10,6 +10,7 @@ from ctgraph_rl.log.files import CURRICULUM
 from ctgraph_rl.log.named_curricula import curriculum_named
 from ctgraph_rl.log.scores import evaluation_noise, lowest_returns, optimal_values
 from ctgraph_rl.metrics import Undefined
+from ctgraph_rl.metrics.adaptation import exact_search
 from ctgraph_rl.metrics.bounds import Known, of_performance
 from ctgraph_rl.metrics.record import METRICS
 from ctgraph_rl.report.intervals import SCALED_DIGITS, UNBOUNDED, Bounds
@@ -117,7 +118,8 @@ def bounds_of_curriculum(curriculum: Curriculum, evaluations: int = 1) -> Bounds
     whole = _around(of_evaluation)
     of_tasks = of_evaluation[: len(curriculum.tasks)]
     shares = _shares(curriculum.tasks, of_tasks)
-    known = Known(*whole, len(of_tasks), evaluations, lowest_share=shares.low, highest_share=shares.high)
+    regrets = _search_regrets(tasks, evaluation)
+    known = Known(*whole, len(of_tasks), evaluations, *shares, *regrets)
     returns = dict(zip(curriculum.labels, of_tasks, strict=True))
     alike = evaluation.greedy and are_graphs(curriculum.tasks) and all(t.is_deterministic for t in curriculum.tasks)
     return BoundsOfRuns(returns, known, _around(of_episode), one_episode=alike)
@@ -125,6 +127,15 @@ def bounds_of_curriculum(curriculum: Curriculum, evaluations: int = 1) -> Bounds
 
 def _around(bounds: Sequence[Bounds]) -> Bounds:
     return Bounds(min(each.low for each in bounds), max(each.high for each in bounds))
+
+
+def _search_regrets(tasks: Sequence[TaskLike], evaluation: Evaluation) -> Bounds:
+    """Return the bounds of the goals that a row of any task misses beside the best search."""
+    if not are_graphs(tasks):
+        return UNBOUNDED
+    episodes = evaluation.row_episodes
+    exact = [exact_search(task.graph.num_end_states, episodes).sum().item() for task in tasks]
+    return Bounds(min(exact) - episodes, max(exact))
 
 
 def _shares(tasks: Sequence[TaskLike], returns: Sequence[Bounds]) -> Bounds:

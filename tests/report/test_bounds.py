@@ -158,6 +158,16 @@ def test_a_first_run_that_is_unfinished_does_not_bound_sums_over_time_by_its_few
     assert bounds.of_metric("total_performance_over_time") == Bounds(0, 16)  # four tasks, four evaluations
 
 
+def test_what_a_search_can_miss_is_bounded_by_the_episodes_of_a_row():
+    learned = curricula.load("goal_search")  # four end states
+    bounds = bounds_of_curriculum(learned).of_metric("search_regret")
+    episodes = learned.evaluation.row_episodes
+    most = sum(min(1, i / 4) for i in range(1, episodes + 1))
+
+    assert bounds == pytest.approx((most - episodes, most))
+    assert bounds_of_curriculum(learned).of_metric("held_out_search_regret") == bounds
+
+
 def test_a_time_is_a_median_that_seeds_that_never_got_there_count_in(tmp_path):
     runs = of_known_curriculum(tmp_path, (1.0, 1.0, 1.0))
     for run, (value, never) in zip(runs, ((2.0, 0), (None, 1), (4.0, 0)), strict=True):
