@@ -13,6 +13,7 @@ from torchrl.record.loggers.common import Logger
 
 from ctgraph_rl.checks import (
     NamedValues,
+    Rule,
     as_path,
     is_int,
     is_json_object,
@@ -248,6 +249,7 @@ class Recorder:
         least = max(self._evaluated, self._trained, self.frames)
         last = self.curriculum.num_frames
         require(
+            self._open_rule(),
             (self.run_dir is not None, "a checkpoint needs a run_dir: Recorder(curriculum, run_dir)"),
             (
                 callable(state),
@@ -293,6 +295,7 @@ class Recorder:
             return self._measured(frames)
         last = self.curriculum.num_frames
         require(
+            self._open_rule(),
             (is_int(frames, 0, last), f"frames must be an integer in 0..{last}, the curriculum's, got {frames!r}"),
             ((policy is None) != (policy_for is None), "give either policy or policy_for"),
         )
@@ -327,6 +330,7 @@ class Recorder:
         no_numbers = [name for name, value in numbers.items() if not isinstance(value, (int, float, type(None)))]
         taken = sorted({"kind", "block", "seconds"} & set(values))
         require(
+            self._open_rule(),
             (is_int(frames, 1, last), f"frames must be an integer in 1..{last}, the curriculum's, got {frames!r}"),
             (not no_numbers, f"{', '.join(no_numbers)} must be numbers or None; leave out what is none"),
             (not taken, f"{', '.join(taken)} are fields of every line of the log: choose other names"),
@@ -373,6 +377,11 @@ class Recorder:
         if self._lock is not None:
             self._lock.close()
             self._lock = None
+
+    def _open_rule(self) -> Rule:
+        """Return the rule that this is not closed: another writer may be in its directory."""
+        is_open = self.run_dir is None or self.finished or self._lock is not None
+        return is_open, f"this Recorder of {self.run_dir} is closed: a Recorder with resume=True resumes its run"
 
     def __getstate__(self) -> NamedValues:
         """Return what a copy has; two recorders cannot write into one directory."""

@@ -68,6 +68,23 @@ def stop(folder: Path, **how: bool) -> None:
         _ = 1 / 0
 
 
+def test_a_recorder_that_is_closed_changes_no_file_of_the_next_writer(tmp_path):
+    first = Recorder(TASKS, tmp_path)
+    first.close()
+    calls = (
+        lambda: first.checkpoint(dict, 0),
+        lambda: first.evaluate(lambda images: [0] * len(images), 0),
+        lambda: first.training(1),
+    )
+
+    with Recorder(TASKS, tmp_path, resume=True):
+        before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+        for call in calls:
+            with pytest.raises(ValueError, match="is closed: a Recorder with resume=True"):
+                call()
+        assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
 def test_a_recorder_that_writes_keeps_all_others_out_until_it_ends_by_an_error_or_is_closed(tmp_path, compose):
     stop(tmp_path)
     stop(tmp_path, overwrite=True)

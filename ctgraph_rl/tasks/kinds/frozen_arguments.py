@@ -36,7 +36,9 @@ def freeze(value: Any) -> Any:
     Raises:
         ValueError: for values that JSON has no form for.
     """
-    if isinstance(value, HELD) or value is None or isinstance(value, (bool, int, float, str)):
+    if isinstance(value, str):
+        return str.__str__(value)  # of an enumeration's member, as JSON has it
+    if isinstance(value, HELD) or value is None or isinstance(value, (bool, int, float)):
         return value
     if isinstance(value, Mapping):
         return DictArgument(tuple((_key(key), freeze(item)) for key, item in value.items()))

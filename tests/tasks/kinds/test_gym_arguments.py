@@ -1,6 +1,7 @@
 """Arguments of environments and wrappers arrive as they were written, through JSON too."""
 
 from dataclasses import replace
+from enum import StrEnum
 from functools import partial
 
 import gymnasium
@@ -112,6 +113,16 @@ def test_arguments_of_different_types_make_different_tasks():
     assert tasks[1] == GymTask("arguments/Keeps-v0", {"x": np.int64(1)})
     assert tasks[11] == GymTask("arguments/Keeps-v0", {"x": {np.int64(1): np.int64(1)}})
     assert hash(tasks[1]) == hash(GymTask("arguments/Keeps-v0", {"x": 1}))
+
+
+def test_a_text_of_an_enumeration_arrives_as_its_text():
+    class Size(StrEnum):
+        SMALL = "small"
+
+    task = GymTask("arguments/Keeps-v0", {"size": Size.SMALL})
+
+    assert type(kept(task)["size"]) is str
+    assert Curriculum.from_json(of(task).to_json()).tasks[0] == task
 
 
 def test_wrappers_take_arguments_in_each_form():
