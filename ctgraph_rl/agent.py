@@ -89,6 +89,24 @@ class Agent(Protocol):
         ...
 
 
+class Model(Protocol):
+    """What an agent may add, to be scored as a model of its environment; see property 9 of `ctgraph_rl.profile`."""
+
+    def predict_next(self, history: TensorDictBase, choices: TensorDictBase) -> Tensor:
+        """Return how likely each pair of observation and reward is to come next.
+
+        Args:
+            history: what each row has met since its episode began, [rows, steps] in time order: ``observation``, the
+                ``action`` that followed, int64, and ``reward``, float32, that came with the observation, 0 with the
+                first. What the last action leads to is asked for.
+            choices: all pairs that can come, [choices]: ``observation`` and ``reward``.
+
+        Returns:
+            Natural logarithms of probabilities that sum to 1 in each row, float [rows, choices].
+        """
+        ...
+
+
 class DetectorLike(Protocol):
     """A detector of task changes, which gives tasks labels. `ctgraph_rl.run` builds it as ``Class(**yaml)``."""
 

@@ -1,8 +1,11 @@
-"""Ten small curricula, one for each learning property that the CT-graph paper lists, and how each is scored.
+"""Curricula for the learning properties that the CT-graph paper lists, and how each property is scored.
 
 Section 1 of Soltoggio et al. 2023 (arXiv 2302.10887) lists the properties in this order. The tasks, the numbers of
 frames and the scores are choices of this package; ``docs/reference/profile.md`` says what a score means. All graphs
 have two branches. Tasks with different image seeds have different images.
+
+Goals come in sets in which each place has both branches equally often. Properties 5, 6 and 10 compare lives of a seed
+that end with the same block, `TARGETS`, and differ in what comes before it; `profile_fresh` has nothing before it.
 """
 
 from __future__ import annotations
@@ -13,7 +16,7 @@ from typing import NamedTuple
 
 from ctgraph_rl.checks import NamedValues, by_name
 from ctgraph_rl.core.graph import CTGraph
-from ctgraph_rl.tasks.configurations import OBSERVABILITY, ct_graph, observations_of
+from ctgraph_rl.tasks.configurations import ct_graph, observations_of
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import PaperImages
 from ctgraph_rl.tasks.protocol import Evaluation, Protocol
@@ -24,96 +27,140 @@ from curricula.order import OneOrMore, as_tasks, sequence
 
 SOURCE = "ctgraph_rl, after section 1 of Soltoggio et al. 2023, arXiv 2302.10887"
 
-CURVES = Evaluation(num_episodes=10, before=False, every=10_240)
-"""Of scores that are areas under curves; without chance in a task, each episode of a greedy policy is the same."""
+VERSION = 2
 
-EIGHT = ((1, 1, 1), (2, 2, 2), (1, 2, 1), (2, 1, 2), (1, 1, 2), (2, 2, 1), (1, 2, 2), (2, 1, 1))
-PAIRED = ((1, 1, 1), (1, 1, 2), (2, 2, 1), (2, 2, 2), (1, 2, 1), (1, 2, 2), (2, 1, 1), (2, 1, 2))
-"""Goals of depth 3: every second one shares two decisions with the one before it, and the others share none."""
+MIRRORED = {2: ((1, 2), (2, 1)), 3: ((1, 2, 1), (2, 1, 2)), 4: ((1, 2, 1, 2), (2, 1, 2, 1))}
+"""Goals by depth. No two decisions in a row are equal, so that a policy must know where it is."""
+
+EIGHT = ((1, 1, 1, 1), (2, 2, 1, 2), (1, 2, 2, 1), (2, 1, 2, 2), (2, 1, 1, 1), (1, 2, 1, 2), (2, 2, 2, 1), (1, 1, 2, 2))
+"""Goals of depth 4: each place has both branches four times."""
+
+SIMILAR = ((1, 1), (2, 2))
+"""Goals that share the first decision with those of `TARGETS`."""
+
+DISSIMILAR = ((2, 1), (1, 2))
+"""Goals that share no decision with those of `TARGETS`."""
+
+CURVE = 12
+"""Evaluations of a block whose area counts; without chance in a task, all episodes of a greedy policy are the same."""
 
 
-def profile_observability(num_frames: int = 409_600) -> Curriculum:
-    """Property 1: the same goal under four degrees of observability, all at once, with random waits.
+def profile_observability(num_frames: int = 819_200) -> Curriculum:
+    """Property 1: four degrees of observability with random waits, two goals each, all at once.
+
+    They are the paper's CT-FO, CT-SU, CT-CO and CT-POSR with p = 0.5, where CT-SU and CT-POSR differ in images alone.
 
     Args:
-        num_frames: frames of the four tasks together.
+        num_frames: frames of the eight tasks together.
     """
     graph = CTGraph(2, 2, 0.5)
-    tasks = []
-    for image_seed, kind in enumerate(OBSERVABILITY, 1):
+    tasks: list[Task] = []
+    for kind in ("full", "surjective", "confounding", "surjective"):
         shown = observations_of(graph, kind)
-        images = PaperImages(shown.last_id + 1, image_seed)
-        tasks.append(Task(graph, (1, 2), shown, images))
+        for goal in MIRRORED[2]:
+            tasks.append(Task(graph, goal, shown, PaperImages(shown.last_id + 1, 1 + len(tasks))))
     return _profile("observability", [tasks], num_frames, Evaluation(before=False))
 
 
 def profile_memory(num_frames: int = 614_400) -> Curriculum:
-    """Property 2: four sequences of growing length, all at once, whose goals need memory; first rewards are guided.
+    """Property 2: sequences of growing length, all at once, whose goals need memory; first rewards are guided.
 
     Args:
-        num_frames: frames of the four tasks together.
+        num_frames: frames of the eight tasks together.
     """
-    lengths = ((2, 0.0), (2, 0.5), (3, 0.5), (4, 0.5))
-    tasks = []
-    for seed, (depth, p) in enumerate(lengths, 1):
-        tasks.append(ct_graph(2, depth, p, _alternating(depth), fully_observable=False, image_seed=seed))
+    tasks: list[Task] = []
+    for goal in (*MIRRORED[2], *MIRRORED[3], *MIRRORED[4], (1, 2, 2, 1), (2, 1, 1, 2)):
+        seed = 1 + len(tasks)
+        tasks.append(ct_graph(2, len(goal), 0.5, goal, fully_observable=False, image_seed=seed))
     protocol = Protocol(guide_frames=num_frames // 2)
     return _profile("memory", [tasks], num_frames, Evaluation(before=False), protocol)
 
 
-def profile_sparsity(num_frames: int = 102_400) -> Curriculum:
+def profile_sparsity(num_frames: int = 57_344) -> Curriculum:
     """Property 3: fully observable goals whose reward random actions rarely meet, the rarest first.
 
+    Each graph has two goals, one after the other on the same images, so that no sequence of actions reaches both.
+
     Args:
-        num_frames: frames of each of the three tasks.
+        num_frames: frames of each of the six goals.
     """
-    tasks = [ct_graph(2, depth, 0.0, _alternating(depth), image_seed=depth) for depth in (7, 6, 5)]
+    tasks: list[Task] = []
+    for depth in (7, 6, 5):
+        tasks += given_goals(ct_graph(2, depth, image_seed=depth), (_alternating(1, depth), _alternating(2, depth)))
     return _profile("sparsity", tasks, num_frames, Evaluation(10, before=False))
 
 
-def profile_adaptation(num_frames: int = 61_440) -> Curriculum:
-    """Property 4: the eight goals of a fully observable graph of depth 3, one after the other, with task ids.
+def profile_adaptation(num_frames: int = 40_960) -> Curriculum:
+    """Property 4: eight goals of a fully observable graph of depth 4, one after the other.
 
     Args:
-        num_frames: frames of each goal.
+        num_frames: frames of each goal, a multiple of 5.
     """
-    tasks = given_goals(ct_graph(2, 3), EIGHT)
-    return _profile("adaptation", tasks, num_frames, CURVES, protocol=Protocol("one_hot"))
+    evaluation = Evaluation(10, before=False, every=num_frames // 5)
+    return _profile("adaptation", given_goals(ct_graph(2, 4), EIGHT), num_frames, evaluation)
 
 
-def profile_similarity(num_frames: int = 61_440) -> Curriculum:
-    """Property 5: the same goals, ordered so that each shares two decisions with the one before it, or none.
+def profile_fresh(num_frames: int = 98_304) -> Curriculum:
+    """Control of properties 5, 6 and 10: two goals of depth 2 on two fully observable graphs, with nothing before.
 
     Args:
-        num_frames: frames of each goal.
+        num_frames: frames of the goals together, a multiple of 24.
     """
-    return _profile("similarity", given_goals(ct_graph(2, 3), PAIRED), num_frames, CURVES)
+    return _life("fresh", (), num_frames)
 
 
-def profile_hierarchy(num_frames: int = 102_400) -> Curriculum:
-    """Property 6: a goal of depth 4 from scratch, then nested goals of depth 2, 3 and 4 on other images.
+def profile_unrelated(num_frames: int = 98_304) -> Curriculum:
+    """Control of properties 6 and 10: the goals of `profile_fresh` after goals of depth 1 on other images.
 
     Args:
-        num_frames: frames of each goal.
+        num_frames: frames of the last goals together, a multiple of 24.
     """
-    scratch = ct_graph(2, 4, 0.0, _alternating(4))
-    deepest = ct_graph(2, 4, 0.0, _alternating(4), image_seed=2)
-    tasks = [scratch, *growing_depth(deepest, (2, 3, 4))]
-    return _profile("hierarchy", tasks, num_frames, CURVES)
+    return _life("unrelated", _first_decisions((3, 4)), num_frames)
+
+
+def profile_similarity(num_frames: int = 98_304) -> Curriculum:
+    """Property 5: the goals of `profile_fresh` after goals of the same graphs that share the first decision.
+
+    Args:
+        num_frames: frames of the last goals together, a multiple of 24.
+    """
+    return _life("similarity", _on_graphs(SIMILAR), num_frames)
+
+
+def profile_dissimilar(num_frames: int = 98_304) -> Curriculum:
+    """Control of properties 5 and 6: the goals of `profile_fresh` after goals of the same graphs that share nothing.
+
+    Args:
+        num_frames: frames of the last goals together, a multiple of 24.
+    """
+    return _life("dissimilar", _on_graphs(DISSIMILAR), num_frames)
+
+
+def profile_hierarchy(num_frames: int = 98_304) -> Curriculum:
+    """Property 6: the goals of `profile_fresh` after their first decisions, goals of graphs of depth 1.
+
+    Args:
+        num_frames: frames of the last goals together, a multiple of 24.
+    """
+    return _life("hierarchy", _first_decisions((1, 2)), num_frames)
 
 
 def profile_attention(num_frames: int = 204_800) -> Curriculum:
     """Property 7: wait states show one of 100 images at random; evaluated with 100 other images, too.
 
     Args:
-        num_frames: frames.
+        num_frames: frames of the two goals together.
     """
-    [task] = as_tasks(co_hard(2, 0.5, unique_decisions=True, num_wait_images=100).tasks)  # type: ignore[arg-type]
-    last = task.observations.last_id
-    task = replace(task, images=PaperImages(last + 101))
-    other = replace(task.observations, wait_ids=(last + 1, last + 100))
-    held_out = replace(task, observations=other)
-    return _profile("attention", [task], num_frames, Evaluation(400, before=False, held_out=(held_out,)))
+    [first] = as_tasks(co_hard(2, 0.5, unique_decisions=True, num_wait_images=100).tasks)  # type: ignore[arg-type]
+    last = first.observations.last_id
+    other = replace(first.observations, wait_ids=(last + 1, last + 100))
+    tasks: list[Task] = []
+    held_out = []
+    for seed, goal in enumerate(MIRRORED[2], 1):
+        task = replace(first, goal=goal, images=PaperImages(last + 101, seed))
+        tasks.append(task)
+        held_out.append(replace(task, observations=other))
+    return _profile("attention", [tasks], num_frames, Evaluation(400, before=False, held_out=tuple(held_out)))
 
 
 def profile_exploration(num_frames: int = 614_400) -> Curriculum:
@@ -126,46 +173,86 @@ def profile_exploration(num_frames: int = 614_400) -> Curriculum:
     return _profile("exploration", [all_goals(ct_graph(2, 2))], num_frames, evaluation)
 
 
-def profile_model(num_frames: int = 102_400) -> Curriculum:
-    """Property 9: a fully observable graph with random waits, of which a table learns a model from the agent's data.
+def profile_model(num_frames: int = 98_304) -> Curriculum:
+    """Property 9: a surjective graph with random waits; what comes next depends on the decisions so far.
 
     Args:
         num_frames: frames that the agent learns from before.
     """
-    return _profile("model", [ct_graph(2, 2, 0.5, (1, 2))], num_frames, Evaluation(before=False))
+    task = ct_graph(2, 2, 0.5, (1, 2), fully_observable=False)
+    return _profile("model", [task], num_frames, Evaluation(before=False))
 
 
-def profile_innate(num_frames: int = 102_400) -> Curriculum:
-    """Property 10: a graph from scratch, then four others at once, then a held-out graph with the images of these.
+def profile_innate(num_frames: int = 98_304) -> Curriculum:
+    """Property 10: the goals of `profile_fresh` after other graphs that share their images.
 
-    The first and the last graph differ in nothing but their images. The four in between have depth 2 and 3, with and
-    without random waits, and other goals.
+    The graphs before have depth 1 and 2, with and without random waits, and goals with another first decision.
 
     Args:
-        num_frames: frames of each block.
+        num_frames: frames of the last goals together, a multiple of 24.
     """
-    scratch = ct_graph(2, 4, 0.0, _alternating(4))
-    deepest = ct_graph(2, 4, 0.0, _alternating(4), image_seed=2)
-    [two, three] = growing_depth(deepest, (2, 3))
-    innate = []
-    for task, goal, p in ((two, (2, 1), 0.0), (two, (2, 2), 0.5), (three, (2, 1, 2), 0.0), (three, (2, 2, 1), 0.5)):
-        innate.append(replace(task, goal=goal, graph=replace(task.graph, wait_prob=p)))
-    return _profile("innate", [scratch, innate, deepest], num_frames, CURVES)
+    return _life("innate", _relatives(), num_frames)
 
 
-def _alternating(depth: int) -> tuple[int, ...]:
-    """The goal 1, 2, 1, 2, ..."""
-    return tuple(1 + place % 2 for place in range(depth))
+def profile_roles(num_frames: int = 98_304) -> Curriculum:
+    """Control of property 10: as `profile_innate`, but before its last block each image stands for another state.
+
+    What wait states show in the last block is shown by decision and end states before, and the other way round. An
+    agent that is slow wherever images are new is not slow here.
+
+    Args:
+        num_frames: frames of the last goals together, a multiple of 24.
+    """
+    before = []
+    for task in _relatives():
+        shown = replace(task.observations, decision_ids=(2, 4), end_ids=(5, 8), wait_ids=(9, 15))
+        before.append(replace(task, observations=shown))
+    return _life("roles", before, num_frames)
+
+
+def _life(name: str, before: Sequence[Task], num_frames: int) -> Curriculum:
+    """Return a block of half as many frames as the last one, if there is anything before, and that of `TARGETS`."""
+    evaluation = Evaluation(10, before=False, every=num_frames // CURVE)
+    if not before:
+        return _profile(name, [TARGETS], num_frames, evaluation)
+    return _profile(name, [before, TARGETS], [num_frames // 2, num_frames], evaluation)
+
+
+def _on_graphs(goals: Sequence[tuple[int, ...]], image_seeds: Sequence[int] = (1, 2)) -> tuple[Task, ...]:
+    """Return a goal on each of two fully observable graphs of depth 2."""
+    return tuple(ct_graph(2, 2, 0.0, goal, image_seed=seed) for goal, seed in zip(goals, image_seeds, strict=True))
+
+
+def _first_decisions(image_seeds: Sequence[int]) -> tuple[Task, ...]:
+    """Return the goals of `TARGETS` as far as their first decision, on images of some seeds."""
+    return growing_depth(_on_graphs(MIRRORED[2], image_seeds), [1])
+
+
+def _relatives() -> list[Task]:
+    """Return graphs with the images of `TARGETS`, whose goals have another first decision."""
+    tasks: list[Task] = []
+    for deep in _on_graphs(DISSIMILAR):
+        tasks += [*growing_depth(deep, [1]), replace(deep, graph=replace(deep.graph, wait_prob=0.5))]
+    return tasks
+
+
+TARGETS = _on_graphs(MIRRORED[2])
+"""The last block of the lives that properties 5, 6 and 10 compare."""
+
+
+def _alternating(first: int, depth: int) -> tuple[int, ...]:
+    """The goal 1, 2, 1, 2, ... or 2, 1, 2, 1, ..."""
+    return tuple(first if place % 2 == 0 else 3 - first for place in range(depth))
 
 
 def _profile(
     name: str,
     blocks: Sequence[OneOrMore],
-    num_frames: int,
+    num_frames: int | Sequence[int],
     evaluation: Evaluation,
     protocol: Protocol | None = None,
 ) -> Curriculum:
-    return sequence(f"profile_{name}", blocks, num_frames, 1, SOURCE, evaluation=evaluation, protocol=protocol)
+    return sequence(f"profile_{name}", blocks, num_frames, VERSION, SOURCE, evaluation=evaluation, protocol=protocol)
 
 
 class Property(NamedTuple):
@@ -174,21 +261,27 @@ class Property(NamedTuple):
     title: str
     measure: str
     arguments: NamedValues
+    controls: tuple[str, ...] = ()  # curricula of the lives that it is compared with
 
+
+AFRESH = ("profile_fresh", "profile_unrelated")
+"""Controls of what an agent reuses: nothing before, and as long a history that shares nothing."""
 
 PROPERTIES = {
-    "profile_observability": Property("observability", "above_ceiling", {"ceiling": "open_loop"}),
-    "profile_memory": Property("memory", "above_ceiling", {"ceiling": "memoryless"}),
-    "profile_sparsity": Property("sparse rewards", "above_random_search", {}),
-    "profile_adaptation": Property("adaptation", "faster", {"on": range(1, 8), "than": [0], "learned": True}),
-    "profile_similarity": Property("similarity", "faster", {"on": [1, 3, 5, 7], "than": [2, 4, 6]}),
-    "profile_hierarchy": Property("hierarchy", "faster", {"on": [3], "than": [0]}),
+    "profile_observability": Property("observability", "above_ceilings", {"sizes": (2, 2, 2, 2)}),
+    "profile_memory": Property("memory", "above_ceilings", {"sizes": (2, 2, 4)}),
+    "profile_sparsity": Property("sparse rewards", "above_random_search", {"sizes": (2, 2, 2)}),
+    "profile_adaptation": Property("adaptation", "faster_than_random_search", {}),
+    "profile_similarity": Property("similarity", "gains", {}, ("profile_fresh", "profile_dissimilar")),
+    "profile_hierarchy": Property("hierarchy", "gains", {}, (*AFRESH, "profile_dissimilar")),
     "profile_attention": Property("attention", "held_out", {}),
     "profile_exploration": Property("exploration", "searches", {}),
-    "profile_model": Property("model", "teaches", {}),
-    "profile_innate": Property("innate knowledge", "faster", {"on": [5], "than": [0]}),
+    "profile_model": Property("model", "predicts", {}),
+    "profile_innate": Property(
+        "innate knowledge", "gains", {}, ("profile_fresh", "profile_unrelated", "profile_roles")
+    ),
 }
-"""The properties in the order of the paper, by their curricula. A measure counts tasks from 0."""
+"""The properties in the order of the paper, by their curricula."""
 
 NAMED = by_name(
     profile_observability,
@@ -201,5 +294,9 @@ NAMED = by_name(
     profile_exploration,
     profile_model,
     profile_innate,
+    profile_fresh,
+    profile_unrelated,
+    profile_dissimilar,
+    profile_roles,
 )
 """The curricula of this module by name."""

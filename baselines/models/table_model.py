@@ -5,9 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from baselines.models.model import Symbols, Transitions, experience, learned_share
-from ctgraph_rl.learn.collect import InitialState, Policy
-from ctgraph_rl.tasks.task import Task
+from baselines.models.model import Symbols, Transitions
 
 
 class TableModel:
@@ -35,17 +33,3 @@ class TableModel:
         share = (every / every.sum())[transitions.pair]
         found = self.counts[context, transitions.pair] + share
         return -(found / (self.counts.sum(1)[context] + 1)).log2()
-
-
-def taught_share(policy: Policy | type, task: Task, initial_state: InitialState | None = None) -> float:
-    """Return `learned_share` of a table that learns from a policy's data, on data of a policy that navigates.
-
-    Args:
-        policy: see `experience`.
-        task: where it acts.
-        initial_state: of an agent with memory.
-    """
-    symbols = Symbols([task])
-    model = TableModel(symbols)
-    model.learn(experience(task, symbols, policy, initial_state=initial_state))
-    return learned_share(model, experience(task, symbols, seed=1), task)

@@ -129,13 +129,13 @@ def play() -> ArgumentParser:
 
 
 def profile() -> ArgumentParser:
-    """Train an agent on ten small curricula, one for each learning property of the paper, and score it.
+    """Train an agent on small curricula for the ten learning properties of the paper, and score it.
 
     Settings are those of ctgraph-rl -m, such as agent=lstm_ppo seed=range(5). Cells use all cores, and the same command
     resumes. Runs go to runs/profile, and the page shows every agent there. Folders in place of settings only score the
     runs in them, those of a Recorder, too. A score is 0 at the floor of an agent without the property and 1 at the
-    optimum. One seed of agent=ppo takes about 154 CPU seconds in all. The exit code is 1 if
-    runs are not done or left out.
+    optimum. One seed of agent=ppo takes about one CPU minute in all. The exit code is 1 if runs are not done or left
+    out.
     """
     parser = _parser(profile)
     parser.add_argument("words", nargs="+", metavar="SETTING=VALUE|FOLDER", help="what to train, or runs to score")

@@ -1,9 +1,8 @@
-"""The page of a profile: a table, a radar with bars beside it, the same numbers as CSV and in LaTeX, and gaps."""
+"""The page of a profile: tables, bars with intervals, the same numbers as CSV and in LaTeX, and gaps."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +17,11 @@ from ctgraph_rl.report.latex import PREAMBLE, Table, TableCell, latex
 from ctgraph_rl.report.style import MOST_AGENTS, WIDTH, agent_style, new_figure, require_packages, short
 
 MEANING = (
-    "A score is 0 at the floor of an agent without the property and 1 at the optimum. Intervals are at 95 % over "
-    "seeds; one seed has none, and equal seeds have none where the floor is measured. A dash is a gap: the agent was "
-    "not measured there, which is no 0."
+    "A score is 0 at the floor of an agent without the property and 1 at the optimum. Intervals are at 95 % over all "
+    "seeds; one seed has none. A dash is a gap: the agent was not measured there, which is no 0."
 )
 
-COLUMNS = ("agent", "property", "score", "low", "high", "n", "reason")
+COLUMNS = ("agent", "property", "score", "low", "high", "n", "reason", "measured", "floor", "optimum", "controls")
 
 
 def write_profile(paths: Sequence[Path | str], folder: Path | str, agents: Sequence[str] = ()) -> Profiles:
@@ -51,17 +49,26 @@ def write_profile(paths: Sequence[Path | str], folder: Path | str, agents: Seque
             rows.append((agent, title, *each))
             if each.reason:
                 gaps.append(markdown_text(f"{agent}, {title}: {each.reason}"))
+    by_agent = _by_agent(scores, titles, str)
+    absolute = _by_agent(scores, titles, lambda score: score.absolute)
+    table = Table(f"Profile. {MEANING}", "profile", "agent", titles, cells)
     folder = made_folder(Path(folder))
     with locked(folder):
         write_whole(folder / "profile.csv", csv_text(rows))
-        table = Table(f"Profile. {MEANING}", "profile", "agent", titles, cells)
         write_whole(folder / "profile.tex", f"{PREAMBLE}\n\n{latex(table)}\n")
-        [drawn] = Gallery(folder).write((), _figures(scores, titles))  # which draws them in the report's style
-        by_title = zip(titles, *(map(str, of_agent.values()) for of_agent in scores.values()), strict=True)
-        by_agent = markdown_table(["property", *map(markdown_text, scores)], by_title)
-        page = ["# Profile", f"![{drawn.alt}]({drawn.path})", drawn.caption, by_agent, *gaps]
+        [drawn] = Gallery(folder).write((), _figures(scores))  # which draws them in the report's style
+        figure = f"![{drawn.alt}]({drawn.path})"
+        page = ["# Profile", figure, drawn.caption, by_agent, "## What was measured", absolute, *gaps]
         write_whole(folder / "profile.md", "\n\n".join(page) + "\n")
     return scores
+
+
+def _by_agent(scores: Profiles, titles: Sequence[str], show: Callable[[Score], str]) -> str:
+    """Return a table in Markdown with a row for each property and a column for each agent."""
+    rows = []
+    for title in titles:
+        rows.append([title, *(show(of_agent[title]) for of_agent in scores.values())])
+    return markdown_table(["property", *map(markdown_text, scores)], rows)
 
 
 def text_table(scores: Profiles) -> str:
@@ -71,7 +78,7 @@ def text_table(scores: Profiles) -> str:
         lines.append(agent)
         for title, each in of_agent.items():
             why = f"  ({each.reason})" if each.reason else ""
-            lines.append(f"  {title:16}  {each}{why}")
+            lines.append(f"  {title:16}  {each!s:17}  {each.absolute}{why}")
     return "\n".join(lines)
 
 
@@ -80,36 +87,34 @@ def _cell(score: Score) -> TableCell:
     return TableCell(value, interval)
 
 
-def _figures(scores: Profiles, titles: Sequence[str]) -> Iterator[CaptionedFigure]:
-    """Draw a radar, and bars with intervals in the order of the paper; a gap has neither corner nor bar."""
-    figure = new_figure(WIDTH, 0.5 * WIDTH)
-    radar = figure.add_subplot(1, 2, 1, projection="polar")
-    bars = figure.add_subplot(1, 2, 2)
-    numbers = np.arange(1, len(titles) + 1)
-    angles = 2 * math.pi * (numbers - 1) / len(titles)
+def _figures(scores: Profiles) -> Iterator[CaptionedFigure]:
+    caption = f"{MEANING}{left_out(len(scores), MOST_AGENTS, 'agents')}"
+    yield CaptionedFigure("profile", "Profile", caption, draw_profiles(scores))
+
+
+def draw_profiles(scores: Profiles) -> Any:
+    """Return a figure of bars with intervals in the order of the paper, in the style that is set; a gap has no bar."""
     shown = list(scores.items())[:MOST_AGENTS]
+    titles = list(shown[0][1])
+    figure = new_figure(WIDTH, 0.25 * WIDTH + 0.1 * WIDTH * len(shown))
+    bars = figure.add_subplot()
+    numbers = np.arange(1, len(titles) + 1)
     height = 0.8 / len(shown)
     for position, (agent, of_agent) in enumerate(shown):
         look = agent_style(position, agent)
         estimates = np.array([each[:3] for each in of_agent.values()], dtype=float)  # None is not a number
-        values = estimates[:, 0]
-        radar.plot(np.append(angles, 0), np.append(values, values[0]), markersize=3, label=short(agent), **look)
         places = numbers + (position + 0.5) * height - 0.4
-        _draw_bars(bars, places, height, estimates, look["color"])
-    radar.set_xticks(angles, numbers)
-    radar.set_rgrids((0.5, 1.0), angle=18, fontsize=6)
-    radar.set(theta_zero_location="N", theta_direction=-1, ylim=(0, 1))
+        _draw_bars(bars, places, height, estimates, look["color"], short(agent))
     bars.set_yticks(numbers, [f"{number} {title}" for number, title in enumerate(titles, 1)])
     bars.set(xlim=(0, 1), xlabel="score", ylim=(len(titles) + 0.5, 0.5))
-    figure.legend(loc="outside upper center", ncols=3)
-    caption = f"{MEANING}{left_out(len(scores), MOST_AGENTS, 'agents')}"
-    yield CaptionedFigure("profile", "Profile", caption, figure)
+    figure.legend(loc="outside upper center", ncols=4)
+    return figure
 
 
-def _draw_bars(axes: Any, places: np.ndarray, height: float, estimates: np.ndarray, color: str) -> None:
+def _draw_bars(axes: Any, places: np.ndarray, height: float, estimates: np.ndarray, color: str, label: str) -> None:
     """Draw the scores of an agent, float [properties, 3]: value and ends of the interval, NaN where there is none."""
     values = estimates[:, 0]
-    axes.barh(places, values, height, color=color)
+    axes.barh(places, values, height, color=color, label=label)
     axes.hlines(places, estimates[:, 1], estimates[:, 2], color="black", linewidth=0.8)
     for place in places[np.isnan(values)]:
         axes.text(0.01, place, "no value", va="center", fontsize=5, color=color)

@@ -2,34 +2,30 @@
 
 from __future__ import annotations
 
-import math
-import sys
 from collections.abc import Callable, Mapping, Sequence
-from importlib import import_module
 from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from ctgraph_rl.checks import by_name
 from ctgraph_rl.log.run_log import RunLog
-from ctgraph_rl.log.scores import mastery_thresholds, optimal_values
 from ctgraph_rl.metrics import Undefined
-from ctgraph_rl.metrics.transfer import stage_areas
-from ctgraph_rl.packages import check_packages
-from ctgraph_rl.runs.load import load
+from ctgraph_rl.profile.floors import all_found_share, best_without_memory, found_share
+from ctgraph_rl.profile.prediction import known_bits
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import Task, ct_graphs
-from ctgraph_rl.tasks.values import memoryless_ceiling, open_loop_ceiling, random_frames_to_goal
+from ctgraph_rl.tasks.values import open_loop_ceiling
 
 
 class Measured(NamedTuple):
-    """The result of a run. Its score is (value - floor) / (optimum - floor)."""
+    """The result of a seed. Over seeds the score is the mean of value - floor over the mean of optimum - floor."""
 
     value: float
-    floor: float
+    floors: tuple[float, ...]  # one that is exact, or those of the controls, in the order of the property's
     optimum: float
+    highest: float = 1.0  # that a value can be; the lowest is 0
     exact: bool = True  # whether floor and optimum are known and not measured
 
 
@@ -39,6 +35,7 @@ class Evidence(NamedTuple):
     log: RunLog
     curriculum: Curriculum
     folder: Path
+    agent_class: Any = None  # of a user; None where it is not imported
 
     @property
     def tasks(self) -> Sequence[Task]:
@@ -46,75 +43,101 @@ class Evidence(NamedTuple):
         return ct_graphs(self.curriculum.tasks, "a profile")
 
     @property
-    def own_returns(self) -> Tensor:
-        """The return on each task at the end of the last block that trains it, float64 [tasks]."""
+    def own_returns(self) -> list[float]:
+        """The return on each task at the end of the last block that trains it."""
         performance = self.log.performance(len(self.tasks))
         last = {task: block for block, trained in enumerate(self.curriculum.trained, 1) for task in trained}
-        return performance[[last[task] for task in range(len(self.tasks))], range(len(self.tasks))]
+        return [performance[last[task], task].item() for task in range(len(self.tasks))]
+
+    def curve(self, block: int) -> Tensor:
+        """The lowest return over the tasks of a block, counted from 1, at each evaluation in it, float64 [evaluations].
+
+        So a difficulty counts as reached where all of its goals are.
+        """
+        curves = self.log.curves(self.curriculum.trained)
+        return curves.performance[curves.of_block(block)][:, list(self.curriculum.trained[block - 1])].amin(1)
 
 
-def above_ceiling(run: Evidence, ceiling: str) -> Measured:
-    """The mean return at the end, between the best of policies that lack something and the best of all.
-
-    Args:
-        run: the run.
-        ceiling: ``open_loop``, of fixed sequences of actions, or ``memoryless``.
-    """
-    of = {"open_loop": open_loop_ceiling, "memoryless": memoryless_ceiling}[ceiling]
-    return Measured(fmean(run.own_returns.tolist()), fmean(map(of, run.tasks)), _optimum(run))
-
-
-def above_random_search(run: Evidence) -> Measured:
-    """The mean return at the end of each task's own block, above a search that acts at random until it is rewarded.
-
-    With m mean frames to the first reward, it finds the goal in n frames with probability 1 - exp(-n / m), and keeps
-    it. Goals are so rare that the number of episodes before the first is geometric with a small probability.
-    """
-    frames = (block.num_frames for block in run.curriculum.blocks)
-    found = [1 - math.exp(-n / random_frames_to_goal(task)) for n, task in zip(frames, run.tasks, strict=True)]
-    return Measured(fmean(run.own_returns.tolist()), fmean(found), _optimum(run))
-
-
-def faster(run: Evidence, on: Sequence[int], than: Sequence[int], learned: bool = False) -> Measured:
-    """The mean area under the evaluation curves of some tasks in their own blocks, above that of others of one shape.
+def above_ceilings(run: Evidence, controls: Sequence[Evidence], sizes: Sequence[int]) -> Measured:
+    """The mean over graphs of the lowest return over their goals, above that of policies that only count steps.
 
     Args:
         run: the run.
-        on: tasks on which an agent with the property is faster.
-        than: those that it learns without what the property gives; their area is the floor, the mean of few tasks.
-        learned: refuse a run that does not master these by the end of their blocks.
+        controls: none.
+        sizes: the number of goals of each kind of graph, in the order of tasks.
+    """
+    returns = _parts(run.own_returns, sizes)
+    floors = _parts([best_without_memory(task) for task in run.tasks], sizes)
+    return Measured(fmean(map(min, returns)), (fmean(map(min, floors)),), 1.0)
+
+
+def above_random_search(run: Evidence, controls: Sequence[Evidence], sizes: Sequence[int]) -> Measured:
+    """The mean over depths of the lowest return over their goals, above that of a search that acts at random.
+
+    It acts at random until it finds the goal of a block, and keeps it.
+
+    Args:
+        run: the run.
+        controls: none.
+        sizes: the number of goals of each depth, in the order of tasks.
+    """
+    returns = _parts(run.own_returns, sizes)
+    tasks = _parts(run.tasks, sizes)
+    frames = _parts([block.num_frames for block in run.curriculum.blocks], sizes)
+    floors = [all_found_share(goals, budgets) for goals, budgets in zip(tasks, frames, strict=True)]
+    return Measured(fmean(map(min, returns)), (fmean(floors),), 1.0)
+
+
+def faster_than_random_search(run: Evidence, controls: Sequence[Evidence]) -> Measured:
+    """The mean area of all goals but the first, above that of a search that acts at random until it finds each goal.
+
+    An area is the mean of the evaluations in a block.
+    """
+    areas = []
+    floors = []
+    start = run.curriculum.ends[0]
+    for block, end in list(enumerate(run.curriculum.ends, 1))[1:]:
+        areas.append(run.curve(block).mean().item())
+        moments = [frames - start for frames in run.curriculum.moments if start < frames <= end]
+        floors.append(fmean(found_share(run.tasks[run.curriculum.trained[block - 1][0]], n) for n in moments))
+        start = end
+    return Measured(fmean(areas), (fmean(floors),), 1.0)
+
+
+def gains(run: Evidence, controls: Sequence[Evidence]) -> Measured:
+    """The area of the last block, above that of the same block in other lives of the same seed.
 
     Raises:
-        Undefined: where the others were learned at once, or not at all though they must be.
+        Undefined: where the last blocks differ, or their evaluations.
     """
-    mastered = mastery_thresholds(run.tasks)
-    assert isinstance(mastered, Tensor)
-    missed = [1 + task for task in than if not run.own_returns[task] >= mastered[task]]
-    if learned and missed:
-        raise Undefined(f"task {missed[0]} was not learned, so nothing can be faster than it")
-    areas = stage_areas(run.log.curves(run.curriculum.trained)).tolist()
-    floor = fmean(areas[task] for task in than)
-    optimum = _optimum(run)
-    if floor == optimum:
-        raise Undefined("the tasks to compare with were solved at their first evaluation, which leaves nothing to gain")
-    return Measured(fmean(areas[task] for task in on), floor, optimum, exact=False)
+    last = run.curriculum.blocks[-1]
+    for control in controls:
+        same = control.curriculum.blocks[-1] == last and control.curriculum.evaluation == run.curriculum.evaluation
+        if not same:
+            raise Undefined(f"{control.folder} ends with another block than {run.folder}: give both the same settings")
+    areas = [each.curve(len(each.curriculum.blocks)).mean().item() for each in (run, *controls)]
+    return Measured(areas[0], tuple(areas[1:]), 1.0, exact=False)
 
 
-def held_out(run: Evidence) -> Measured:
-    """The mean return with held-out wait images, above that of acting at random at new images.
+def held_out(run: Evidence, controls: Sequence[Evidence]) -> Measured:
+    """The lowest return over goals with held-out wait images, above that of a fixed sequence of actions.
 
-    A policy that else is right waits with probability a = 1 / (b + 1) there. So it leaves a wait state with probability
-    w = a (1 - p) / (1 - a p), and reaches the goal of d decisions with probability w^(d + 1).
+    A policy that is right, but acts at random at new images, waits with probability a = 1 / (b + 1) there. So it leaves
+    a wait state with probability w = a (1 - p) / (1 - a p), and reaches the goal of d decisions with probability
+    w^(d + 1), if that is more.
     """
-    returns = [m["return_mean"] for m in run.log.of_kind("evaluation") if m.get("held_out")]
-    [task] = ct_graphs(run.curriculum.evaluation.held_out, "a profile")
-    waits = 1 / task.num_actions
-    p = task.graph.wait_prob
-    floor = (waits * (1 - p) / (1 - waits * p)) ** (task.graph.depth + 1)
-    return Measured(returns[-1] if returns else math.nan, floor, _optimum(run))
+    tasks = ct_graphs(run.curriculum.evaluation.held_out, "a profile")
+    last = {m["task"]: m["return_mean"] for m in run.log.of_kind("evaluation") if m.get("held_out")}
+    floors = []
+    for task in tasks:
+        waits = 1 / task.num_actions
+        p = task.graph.wait_prob
+        leaves = waits * (1 - p) / (1 - waits * p)
+        floors.append(max(open_loop_ceiling(task), leaves ** (task.graph.depth + 1)))
+    return Measured(min(last.values()), (min(floors),), 1.0)
 
 
-def searches(run: Evidence) -> Measured:
+def searches(run: Evidence, controls: Sequence[Evidence]) -> Measured:
     """The success rate over the first n episodes of a row with one of n goals, above that of always the same path.
 
     The floor is 1 / n, the optimum the mean of min(1, i / n) over episodes i: the best search; see
@@ -123,53 +146,53 @@ def searches(run: Evidence) -> Measured:
     found = run.log.adaptation()
     if found is None:
         raise Undefined("the log has no evaluation with adaptation")
-    return Measured(found.success.mean().item(), found.exact[:, 0].mean().item(), found.exact.mean().item())
+    return Measured(found.success.mean().item(), (found.exact[:, 0].mean().item(),), found.exact.mean().item())
 
 
-def teaches(run: Evidence) -> Measured:
-    """How exact a table predicts what a navigating policy meets, learned from data of the trained agent.
+def predicts(run: Evidence, controls: Sequence[Evidence]) -> Measured:
+    """The bits that the agent's own model knows of what comes next, above those of the best memoryless predictor.
 
-    0 is a table of frequencies, 1 the exact model; see `baselines.models.model.learned_share`.
+    See `ctgraph_rl.profile.prediction.known_bits`.
+
+    Raises:
+        Undefined: for an agent without ``predict_next``, and a log without its agent.
     """
-    trained = load(run.folder, _imported_class(run))
     [task] = run.tasks
-    check_packages()
-    taught_share = import_module("baselines.models.table_model").taught_share
-    share = taught_share(trained.policy_for(task), task, trained.agent.initial_state)
-    return Measured(max(0.0, share), 0.0, 1.0)
+    known = known_bits(run.folder, run.agent_class, task)
+    return Measured(known.value, (known.memoryless,), known.exact, highest=known.highest)
 
 
-def _imported_class(run: Evidence) -> Any:
-    """Return the class of a run's agent; None if its module is not imported, as nothing of a file is."""
-    config = run.log.of_kind("run")[0].get("config") or {}
-    module, _, name = str(config.get("agent", {}).get("_target_")).rpartition(".")
-    kind = getattr(sys.modules.get(module), name, None)
-    is_agent = isinstance(kind, type) and kind.__module__ == module and issubclass(kind, nn.Module)
-    return kind if is_agent else None
+def _parts(values: Sequence[Any], sizes: Sequence[int]) -> list[Sequence[Any]]:
+    """Return values in groups of some sizes.
+
+    Raises:
+        Undefined: where they are not as many.
+    """
+    if sum(sizes) != len(values):
+        raise Undefined(f"the property has {sum(sizes)} tasks, this curriculum has {len(values)}")
+    parts = []
+    start = 0
+    for size in sizes:
+        parts.append(values[start : start + size])
+        start += size
+    return parts
 
 
 MEASURES: Mapping[str, Callable[..., Measured]] = by_name(
-    above_ceiling, above_random_search, faster, held_out, searches, teaches
+    above_ceilings, above_random_search, faster_than_random_search, gains, held_out, searches, predicts
 )
 """The measures by name, as a table of properties names them."""
 
 
-def measure(run: Evidence, prop: Any) -> Measured:
-    """Apply the measure of a `curricula.profile.Property`.
+def measure(run: Evidence, controls: Sequence[Evidence], prop: Any) -> Measured:
+    """Return what a run says about a property of `curricula.profile.PROPERTIES`.
+
+    Args:
+        run: the run.
+        controls: the runs of the property's controls, of the same agent and seed.
+        prop: the property.
 
     Raises:
-        Undefined: where the run has no value, with the reason.
+        Undefined: where the run has no value.
     """
-    try:
-        found = MEASURES[prop.measure](run, **prop.arguments)
-    except (ValueError, OSError) as error:
-        raise Undefined(str(error)) from error
-    if not all(map(math.isfinite, found)):
-        raise Undefined("an evaluation is missing")
-    return found
-
-
-def _optimum(run: Evidence) -> float:
-    best = optimal_values(run.tasks)
-    assert isinstance(best, Tensor)
-    return best.mean().item()
+    return MEASURES[prop.measure](run, controls, **prop.arguments)

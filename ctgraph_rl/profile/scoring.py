@@ -2,68 +2,185 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+import shlex
+import sys
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
+import yaml
+
 from ctgraph_rl.checks import ReadOnlyValues, require
+from ctgraph_rl.learn.evaluate import Evaluator
 from ctgraph_rl.log.files import CURRICULUM, LOG
 from ctgraph_rl.log.named_curricula import curriculum_named
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.metrics import Undefined
 from ctgraph_rl.packages import check_packages
 from ctgraph_rl.profile.properties import Evidence, Measured, measure
-from ctgraph_rl.report.intervals import UNBOUNDED, Bounds
+from ctgraph_rl.report.intervals import Bounds, gaffke
 from ctgraph_rl.report.names import displayed
-from ctgraph_rl.report.statistics import mean
-from ctgraph_rl.runs.read import MODIFIED, BySeed, Run, find_runs, grouped
+from ctgraph_rl.runs.read import MODIFIED, Problem, Run, find_runs, grouped, present
 from ctgraph_rl.tasks.curriculum import Curriculum
+
+LEVEL = 0.95
+
+HALVINGS = 20
+"""Of [0, 1], to find an end of an interval."""
+
+
+REPLACED = ("curriculum=", "seed=", "overwrite=")
+"""Settings of a run that a command says anew."""
+
+OF_AGENTS = ("policy_for", "initial_state", "learn", "load_state_dict")
+"""Methods by which a class is known as one of an agent."""
 
 
 class Score(NamedTuple):
-    """A score over seeds; without a value, the reason."""
+    """A score over seeds; without a value, the reason. Means over seeds stand beside it."""
 
     value: float | None
     low: float | None = None
     high: float | None = None
     n: int = 0
     reason: str = ""
+    measured: float | None = None  # mean of what was measured
+    floor: float | None = None
+    optimum: float | None = None
+    controls: str = ""  # the means of the controls that the floor is the best of; empty where it is exact
 
     def __str__(self) -> str:
         value = "-" if self.value is None else f"{self.value:.2f}"
         return value if self.low is None else f"{value} [{self.low:.2f}, {self.high:.2f}]"
+
+    @property
+    def absolute(self) -> str:
+        """What was measured, the floor and the optimum."""
+        if self.measured is None:
+            return "-"
+        of = f" (best of {self.controls})" if self.controls else ""
+        return f"{self.measured:.2f}, floor {self.floor:.2f}{of}, optimum {self.optimum:.2f}"
 
 
 Profiles = Mapping[str, Mapping[str, Score]]
 """For each agent the scores by the titles of the properties, in the order of the paper."""
 
 
-def score_of(results: Sequence[Measured]) -> Score:
-    """Return the ratio of means over seeds, (value - floor) / (optimum - floor), within [0, 1], with a 95 % interval.
+def score_of(results: Sequence[Measured], controls: Sequence[str] = ()) -> Score:
+    """Return the mean of value - floor over the mean of optimum - floor, within [0, 1], with a 95 % interval.
 
-    Where floor and optimum are exact it is a mean of bounded scores, and the interval is Gaffke's, which covers with
-    few seeds, too. Where they are measured it is Student's of the ratio, to first order, so that their own spread
-    counts. One seed has no interval, nor have equal seeds there.
+    All seeds are in it: one without room adds value - floor to the first mean and 0 to the second. The floor is that of
+    the control with the best mean.
 
     Args:
         results: one for each seed, at least one.
+        controls: the curricula that floors were measured on.
+
+    Raises:
+        Undefined: where the controls leave no room.
     """
-    room = fmean(each.optimum - each.floor for each in results)
-    ratio = fmean(each.value - each.floor for each in results) / room
-    rest = [each.value - each.floor - ratio * (each.optimum - each.floor) for each in results]
-    exact = Bounds(min(-each.floor / room for each in results), 1.0)
-    bounds = exact if all(each.exact for each in results) else UNBOUNDED
-    found = mean([ratio + each / room for each in rest], bounds=bounds)
+    means = [fmean(floors) for floors in zip(*(each.floors for each in results), strict=True)]
+    best = means.index(max(means))
+    measured = fmean(each.value for each in results)
+    optimum = fmean(each.optimum for each in results)
+    if optimum - means[best] <= 0:
+        raise Undefined(f"{controls[best] if controls else 'the floor'} leaves no room")
+    ratio = (measured - means[best]) / (optimum - means[best])
     value = min(max(ratio, 0.0), 1.0)
-    if found.low is None or found.high is None:
-        return Score(value, n=found.n)
-    return Score(value, min(max(found.low, 0.0), value), max(min(found.high, 1.0), value), found.n)
+    low = high = None
+    if len(results) > 1:
+        found = _exact_interval(results) if results[0].exact else _paired_interval(results)
+        low = min(max(found[0], 0.0), value)
+        high = max(min(found[1], 1.0), value)
+    said = ", ".join(f"{name} {mean:.2f}" for name, mean in zip(controls, means, strict=False))
+    return Score(value, low, high, len(results), "", measured, means[best], optimum, said)
+
+
+def _exact_interval(results: Sequence[Measured]) -> tuple[float, float]:
+    """Return Gaffke's interval of the mean score, where floor and optimum are the same for all seeds."""
+    [floor] = results[0].floors
+    room = results[0].optimum - floor
+    scores = [(each.value - floor) / room for each in results]
+    return gaffke(scores, Bounds(-floor / room, (results[0].highest - floor) / room), LEVEL)
+
+
+def _paired_interval(results: Sequence[Measured]) -> tuple[float, float]:
+    """Return the scores r that no control contradicts.
+
+    With areas A of a seed and C of its control, both in [0, 1], r is the score above this control where the mean of
+    A - C - r(1 - C) is 0. Its values are within [-1, 1 - r], so r is contradicted where Gaffke's interval of their mean
+    leaves out 0. The score is the lowest one above a control.
+    """
+    lows = []
+    highs = []
+    for control in range(len(results[0].floors)):
+        pairs = [(each.value, each.floors[control]) for each in results]
+        lows.append(_highest(lambda score, pairs=pairs: rest_of_gain(pairs, score)[0] > 0))  # type: ignore[misc]
+        highs.append(_highest(lambda score, pairs=pairs: rest_of_gain(pairs, score)[1] >= 0))  # type: ignore[misc]
+    return min(lows), min(highs)
+
+
+def rest_of_gain(pairs: Sequence[tuple[float, float]], score: float) -> tuple[float, float]:
+    """Return Gaffke's interval of the mean of A - C - score (1 - C), which is 0 for the true score.
+
+    Args:
+        pairs: areas A and C of each seed, in [0, 1].
+        score: in [0, 1].
+    """
+    rest = [own - control - score * (1 - control) for own, control in pairs]
+    return gaffke(rest, Bounds(-1.0, 1 - score), LEVEL)
+
+
+def _highest(holds: Callable[[float], bool]) -> float:
+    """Return the highest score in [0, 1] below which a property holds that no higher one has; 0 if none has it."""
+    low = 0.0
+    high = 1.0
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        if holds(middle):
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@dataclass
+class _Runs:
+    """The runs of the profile, by agent, curriculum and seed; the modified ones apart."""
+
+    by_name: dict[tuple[str, str, bool], dict[int, Run]] = field(default_factory=dict)
+    read: dict[Path, Evidence] = field(default_factory=dict)
+
+    def evidence(self, run: Run) -> Evidence:
+        """Return what a run has measured, which is read once.
+
+        Raises:
+            Undefined: for a run without results; see `_evidence`.
+        """
+        if run.path not in self.read:
+            self.read[run.path] = _evidence(run)
+        return self.read[run.path]
+
+
+class Results(NamedTuple):
+    """What the seeds of an agent have measured of a property; without any, the reason."""
+
+    seeds: Mapping[int, Measured]
+    reason: str = ""
+    controls: tuple[str, ...] = ()
 
 
 def profile_scores(paths: Sequence[Path | str], agents: Sequence[str] = ()) -> dict[str, dict[str, Score]]:
     """Return the scores of all agents whose runs of profile curricula are in or below some folders.
+
+    A property counts all seeds of an agent or none: it has a gap where a run is not finished, was evaluated at other
+    moments than its curriculum says, or lacks a control of the same seed. The reason names the run and the command that
+    gives what it lacks.
 
     Args:
         paths: folders of runs, of ``ctgraph-rl profile`` or of a `ctgraph_rl.Recorder`.
@@ -76,51 +193,152 @@ def profile_scores(paths: Sequence[Path | str], agents: Sequence[str] = ()) -> d
     Raises:
         ValueError: if there is no run of a profile curriculum.
     """
+    scores: dict[str, dict[str, Score]] = {}
+    for agent, by_title in profile_results(paths, agents).items():
+        scores[agent] = {title: score_of_results(results) for title, results in by_title.items()}
+    return scores
+
+
+def score_of_results(results: Results) -> Score:
+    """Return `score_of` what seeds have measured, or a gap with its reason."""
+    if not results.seeds:
+        return Score(None, reason=results.reason)
+    try:
+        return score_of(list(results.seeds.values()), results.controls)._replace(reason=results.reason)
+    except Undefined as error:
+        return Score(None, reason=": ".join(filter(None, [results.reason, str(error)])))
+
+
+def profile_results(paths: Sequence[Path | str], agents: Sequence[str] = ()) -> dict[str, dict[str, Results]]:
+    """Return what each agent's seeds have measured, by the title of each property; see `profile_scores`."""
     properties = profile_properties()
+    names = {*properties}
+    for prop in properties.values():
+        names.update(prop.controls)
     runs, problems = find_runs(paths)
-    runs = [run for run in runs if run.group[0] in properties]
+    runs = [run for run in runs if run.group[0] in names]
     why = "; ".join(problem.reason for problem in problems)
     first = next(iter(properties))
     require((bool(runs), why or f"no run of a profile in {', '.join(map(str, paths))}: learn curriculum={first}"))
-    found: dict[str, dict[str, Score]] = {}
+    found = _Runs()
+    shown: dict[str, None] = {}
     for (curriculum, agent), by_seed in grouped(displayed(runs, agents)).items():
-        prop = properties[curriculum.partition(" ")[0]]
-        missing = {each.title: Score(None, reason="there is no run") for each in properties.values()}
-        scores = found.setdefault(agent, missing)
-        score = _over_seeds(by_seed, prop)
-        is_modified = MODIFIED in curriculum
-        if is_modified:
-            score = score._replace(reason=": ".join(filter(None, [f"of {curriculum}", score.reason])))
-        if not scores[prop.title].n or (score.n and not is_modified):
-            scores[prop.title] = score
-    return found
+        shown[agent] = None
+        for run in present(by_seed):
+            key = (agent, run.group[0], MODIFIED in curriculum)
+            found.by_name.setdefault(key, {})[run.seed] = run
+    results: dict[str, dict[str, Results]] = {}
+    for agent in shown:
+        results[agent] = {}
+        for name, prop in properties.items():
+            results[agent][prop.title] = _results(found, agent, name, prop, problems)
+    return results
 
 
-def _over_seeds(by_seed: BySeed, prop: Any) -> Score:
-    """Return the score of the seeds that have a value, with the reason of one that has none."""
-    results = []
-    reason = ""
-    for seed, run in by_seed.items():
-        try:
-            results.append(measure(_evidence(run), prop))
-        except Undefined as error:
-            reason = f"seed {seed}: {error}"
-    return score_of(results)._replace(reason=reason) if results else Score(None, reason=reason)
+def _results(found: _Runs, agent: str, name: str, prop: Any, problems: Sequence[Problem]) -> Results:
+    """Return what an agent's seeds have measured: on the published curriculum, or else on a modified one."""
+    gaps = []
+    for is_modified in (False, True):
+        by_seed = found.by_name.get((agent, name, is_modified), {})
+        said = f"of {name}{MODIFIED}" if is_modified else ""
+        if by_seed:
+            try:
+                return Results(_over_seeds(found, agent, by_seed, prop, is_modified), said, prop.controls)
+            except Undefined as error:
+                gaps.append(": ".join(filter(None, [said, str(error)])))
+    began = [problem.reason for problem in problems if problem.path.parent.name == name]
+    return Results({}, next(iter([*gaps, *began]), "there is no run"))
 
 
-def _evidence(run: Run | None) -> Evidence:
+def _over_seeds(
+    found: _Runs, agent: str, by_seed: Mapping[int, Run], prop: Any, is_modified: bool
+) -> dict[int, Measured]:
+    """Return what each seed has measured.
+
+    Raises:
+        Undefined: where one has not, with the reason and what gives it.
+    """
+    results = {}
+    for seed, run in sorted(by_seed.items()):
+        controls = []
+        for name in prop.controls:
+            control = found.by_name.get((agent, name, is_modified), {}).get(seed)
+            if control is None:
+                raise Undefined(f"{run.path} lacks its control {name}: {_command(run, name)}")
+            controls.append(found.evidence(control))
+        results[seed] = _measured(found.evidence(run), controls, prop)
+    return results
+
+
+def _measured(run: Evidence, controls: Sequence[Evidence], prop: Any) -> Measured:
+    try:
+        measured = measure(run, controls, prop)
+    except (ValueError, OSError) as error:
+        raise Undefined(f"{run.folder}: {error}") from error
+    if not all(map(math.isfinite, (measured.value, *measured.floors))):
+        raise Undefined(f"{run.folder}: an evaluation has no mean return")
+    return measured
+
+
+def _evidence(run: Run) -> Evidence:
     """Return what a run has measured, and what it learned.
 
     Raises:
-        Undefined: for a run that is not finished, and one of another curriculum than published that is not stored.
+        Undefined: for a run that is not finished, one of another curriculum than published that is not stored, one of
+            an earlier version, and one that was evaluated at other moments than its curriculum says.
     """
-    if run is None or run.reason:
-        raise Undefined("there is no run" if run is None else str(run.reason))
+    if run.reason:
+        raise Undefined(f"{run.path} has no results, {run.reason}: {_command(run)}")
     stored = run.path / CURRICULUM
-    learned = Curriculum.from_json(stored) if stored.exists() else curriculum_named(run.group[0])
+    published = curriculum_named(run.group[0])
+    learned = Curriculum.from_json(stored) if stored.exists() else published
     if learned.fingerprint != run.curriculum[1]:
         raise Undefined(f"{run.path} learned another curriculum than the published {run.group[0]}")
-    return Evidence(RunLog.read(run.path / LOG), learned, run.path)
+    if learned.version != published.version:
+        raise Undefined(
+            f"{run.path} learned version {learned.version} of {learned.name}, the profile has version "
+            f"{published.version}: train it again in another folder"
+        )
+    log = RunLog.read(run.path / LOG)
+    lacking = _lacking(log, learned)
+    if lacking:
+        raise Undefined(f"{run.path} {lacking}: {_command(run)} overwrite=true")
+    return Evidence(log, learned, run.path, _imported_class(run))
+
+
+def _lacking(log: RunLog, curriculum: Curriculum) -> str:
+    """Return how the evaluations of a log differ from those of its curriculum; empty where they do not."""
+    evaluator = Evaluator(curriculum, 0, RunLog())
+    due: Counter[tuple[int, int]] = Counter()
+    for frames in curriculum.moments:
+        for number, _ in evaluator.tasks_at(frames).values():
+            due[frames, number] += 1
+    made = Counter((m["frames"], m["task"]) for m in log.of_kind("evaluation"))
+    for word, others in (("lacks the evaluation", due - made), ("has one evaluation too many", made - due)):
+        if others:
+            frames, number = min(others)
+            return f"{word} of task {number} after {frames:,} frames"
+    return ""
+
+
+def _command(run: Run, curriculum: str = "") -> str:
+    """Return the command that trains a run, or one of its agent and seed on another curriculum, in the same folder."""
+    curriculum = curriculum or run.group[0]
+    typed = run.path / ".hydra" / "overrides.yaml"
+    if not typed.exists():
+        return f"give Recorder(curricula.load({curriculum!r}), ...) all evaluations of its moments"
+    own = [word for word in yaml.safe_load(typed.read_text(encoding="utf-8")) if not word.startswith(REPLACED)]
+    words = [*own, f"curriculum={curriculum}", f"seed={run.seed}", f"hydra.sweep.dir={run.path.parent.parent}"]
+    return f"ctgraph-rl profile {shlex.join(words)}"
+
+
+def _imported_class(run: Run) -> Any:
+    """Return the class of a run's agent; None if its module is not imported, as nothing of a file is."""
+    agent = run.about["config"].get("agent")
+    module, _, name = str(agent.get("_target_") if isinstance(agent, Mapping) else agent).rpartition(".")
+    kind = getattr(sys.modules.get(module), name, None)
+    is_agent = isinstance(kind, type) and kind.__module__ == module and all(hasattr(kind, each) for each in OF_AGENTS)
+    return kind if is_agent else None
 
 
 def profile_properties() -> ReadOnlyValues:

@@ -22,6 +22,7 @@ PAGES = {
     "lifelong": "studies.lifelong.page",
     "memory": "studies.memory.page",
     "no_labels": "studies.no_labels.page",
+    "profile": "studies.profile",
 }
 """Pages, and the modules that make them."""
 
@@ -45,6 +46,7 @@ TABLES = {
     "adaptation_swap": "studies.adaptation_swap",
     "claim_runs": "studies.claim_runs",
     "every_curriculum": "studies.every_curriculum",
+    "profile": "studies.profile",
     "task_free": "studies.no_labels.task_free",
     "together_fo_b1": "studies.together",
 }

@@ -119,7 +119,7 @@ def test_every_budget_can_be_made_short():
     for name in NAMES:
         short = curricula.load(name, num_frames=512)
 
-        assert {block.num_frames for block in short.blocks} == {512}, name
+        assert max(block.num_frames for block in short.blocks) == 512, name
         assert short.tasks == curricula.load(name).tasks, name
 
 

@@ -1,235 +1,282 @@
-"""The profile: the policy of each floor scores 0 and that of each optimum 1, and the page shows gaps as gaps."""
+"""Scores over seeds: which runs count, which are refused and why, intervals, and the page."""
 
 from __future__ import annotations
 
-import math
+import csv
+import json
 import re
 import subprocess
 import sys
-from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from helpers.profiles import LATE, life
 
 import curricula
-from baselines.models.table_model import taught_share
-from ctgraph_rl import Recorder, RunLog
-from ctgraph_rl.env import CTGraphEnv
-from ctgraph_rl.learn.evaluate import Evaluator
+from ctgraph_rl import Recorder
 from ctgraph_rl.metrics import Undefined
 from ctgraph_rl.packages import conf_dir
-from ctgraph_rl.policies import NavigationPolicy, OptimalPolicy, RandomPolicy, SearchPolicy
-from ctgraph_rl.profile.properties import Evidence, Measured, measure
-from ctgraph_rl.profile.scoring import profile_scores, score_of
-from ctgraph_rl.tasks.configurations import ct_graph
-from ctgraph_rl.tasks.values import random_frames_to_goal
-from curricula.profile import PROPERTIES
+from ctgraph_rl.profile.profile_page import write_profile
+from ctgraph_rl.profile.properties import Measured, measure
+from ctgraph_rl.profile.scoring import profile_scores, rest_of_gain, score_of
+from curricula.profile import PROPERTIES, TARGETS
+
+LIVES = ("profile_fresh", "profile_unrelated", "profile_similarity", "profile_dissimilar", "profile_hierarchy")
 
 
-class BestOpenLoop(RandomPolicy):
-    """The actions to the goal 1.2 that leave each wait state at the first try, whatever is seen."""
-
-    def action(self, tensordict):
-        step = tensordict["step_count"].squeeze(-1)
-        return torch.where(step == 2, 1, torch.where(step == 4, 2, 0))
+def waits(images):
+    return torch.zeros(len(images), dtype=torch.int64)
 
 
-class BestMemoryless(OptimalPolicy):
-    """Decides for the first branch as often as an alternating goal does."""
-
-    def decision(self, tensordict):
-        depth = torch.tensor([task.graph.depth for task in self.env.tasks])
-        return 2 - (torch.rand(depth.shape) < (depth + 1) // 2 / depth).long()
-
-
-class LuckySearch(OptimalPolicy):
-    """Keeps the goal in those rows in which random actions found it in 102,400 frames, and else fails."""
-
-    def __init__(self, env):
-        super().__init__(env)
-        means = torch.tensor([random_frames_to_goal(task) for task in env.tasks])
-        self.found = torch.rand(means.shape) < 1 - (-102_400 / means).exp()
-
-    def action(self, tensordict):
-        return torch.where(self.found, super().action(tensordict), 1)
+def record(folder, name, moments=None, seed=0, **changes):
+    """A run of a Recorder, evaluated at all moments of its curriculum or at others."""
+    curriculum = curricula.load(name, **changes)
+    with Recorder(curriculum, folder, seed=seed, about={"agent": "Mine"}) as recorder:
+        for frames in curriculum.moments if moments is None else moments:
+            recorder.evaluate(waits, frames)
+    return curriculum
 
 
-class RandomAtNewImages(OptimalPolicy):
-    """Acts at random at images beyond those that were trained."""
-
-    def action(self, tensordict):
-        new = self.env.observation_id > 105
-        return torch.where(new, self._random_below(self.env.branching_factor + 1), super().action(tensordict))
-
-
-class OnePath(OptimalPolicy):
-    """Goes to the first end state in each episode."""
-
-    def decision(self, tensordict):
-        return self._towards(torch.zeros_like(self.env.goal_leaf))
-
-
-FLOORS = {
-    "profile_observability": BestOpenLoop,
-    "profile_memory": BestMemoryless,
-    "profile_sparsity": LuckySearch,
-    "profile_attention": RandomAtNewImages,
-    "profile_exploration": OnePath,
-}
-
-
-def ratio(measured: Measured) -> float:
-    return (measured.value - measured.floor) / (measured.optimum - measured.floor)
-
-
-def of_policy(name, policy, num_episodes=1500):
-    curriculum = curricula.load(name)
-    curriculum = replace(curriculum, evaluation=replace(curriculum.evaluation, num_episodes=num_episodes))
-    log = RunLog()
-    for frames in curriculum.ends:
-        Evaluator(curriculum, 0, log).evaluate(policy, frames, "after")
-    return ratio(measured(name, log, curriculum))
-
-
-def measured(name, log, curriculum=None):
-    run = Evidence(log, curriculum or curricula.load(name), Path("nowhere"))
-    return measure(run, PROPERTIES[name])
-
-
-RARE = pytest.param("profile_sparsity", marks=pytest.mark.slow)
-
-
-@pytest.mark.parametrize("name", [RARE if name == "profile_sparsity" else name for name in FLOORS])
-def test_the_policy_of_a_floor_scores_0(name):
-    assert of_policy(name, FLOORS[name]) == pytest.approx(0, abs=0.02)
-
-
-@pytest.mark.parametrize("name", FLOORS)
-def test_the_policy_of_an_optimum_scores_1(name):
-    searches = name == "profile_exploration"
-    policy = SearchPolicy if searches else OptimalPolicy
-
-    assert of_policy(name, policy, 1500 if searches else 10) == pytest.approx(1, abs=0.02)
-
-
-def curves(name, solves):
-    """A log of an agent that solves each task from the evaluation number ``solves(task)`` of its block on."""
-    curriculum = curricula.load(name)
-    log = RunLog()
-    log.append("run", trained=[[1 + task for task in block] for block in curriculum.trained])
-    every = curriculum.evaluation.every
-    starts = (0, *curriculum.ends)
-    for block, (start, end) in enumerate(zip(starts, curriculum.ends, strict=False), 1):
-        for number, frames in enumerate(range(start + every, end + 1, every), 1):
-            moment = "after" if frames == end else "during"
-            for task in range(len(curriculum.tasks)):
-                solved = float(task in curriculum.trained[block - 1] and number >= solves(task))
-                log.append("evaluation", block=block, frames=frames, task=task + 1, return_mean=solved, moment=moment)
-    return log
-
-
-FASTER = [name for name, prop in PROPERTIES.items() if prop.measure == "faster"]
-
-
-@pytest.mark.parametrize("name", FASTER)
-def test_a_learner_to_which_all_tasks_are_new_scores_0(name):
-    assert ratio(measured(name, curves(name, lambda task: 4))) == pytest.approx(0, abs=1e-9)
-
-
-@pytest.mark.parametrize("name", FASTER)
-def test_a_learner_that_knows_what_a_property_gives_scores_1(name):
-    gives = PROPERTIES[name].arguments["on"]
-
-    score = ratio(measured(name, curves(name, lambda task: 1 if task in gives else 4)))
-
-    assert score == pytest.approx(1, abs=1e-9)
-
-
-def test_a_learner_that_does_not_learn_the_first_task_has_no_speed_of_adaptation():
-    log = curves("profile_adaptation", lambda task: 1 if task else math.inf)
-
-    with pytest.raises(Undefined, match="task 1 was not learned"):
-        measured("profile_adaptation", log)
-
-
-def test_the_goals_of_the_similarity_share_two_decisions_or_none_with_the_one_before():
-    goals = [task.goal for task in curricula.load("profile_similarity").tasks]
-    shared = [next(i for i in range(4) if i == 3 or a[i] != b[i]) for a, b in pairwise(goals)]
-
-    found = dict(enumerate(shared, 1))
-
-    on, than = PROPERTIES["profile_similarity"].arguments.values()
-    assert {found[task] for task in on} == {2}
-    assert {found[task] for task in than} == {0}
-
-
-def test_the_data_of_a_policy_that_goes_everywhere_teach_the_exact_model():
-    [task] = curricula.load("profile_model").tasks
-
-    assert taught_share(NavigationPolicy, task) == pytest.approx(1, abs=0.02)
-
-
-@pytest.mark.slow
-def test_random_search_finds_a_goal_in_time_with_the_probability_of_the_floor():
-    task = ct_graph(2, 3)
-    steps = 4000
-    env = CTGraphEnv([task] * 500, 0)
-    torch.manual_seed(0)
-    rewarded = env.rollout(steps, RandomPolicy(env), break_when_any_done=False)["next", "reward"].amax(1) > 0
-
-    expected = 1 - math.exp(-steps / random_frames_to_goal(task))
-
-    assert 0.4 < expected < 0.8
-    assert rewarded.double().mean().item() == pytest.approx(expected, abs=4 * math.sqrt(0.25 / 500))
-
-
-def test_scores_over_seeds_are_a_ratio_of_means_whose_interval_has_the_spread_of_the_floor():
-    results = [Measured(0.8, floor, 1.0, exact=False) for floor in (0.2, 0.4, 0.6)]
+def test_a_score_is_a_ratio_of_means_over_all_seeds():
+    results = [Measured(value, (0.2,), 1.0) for value in (0.2, 0.6, 1.0)]
 
     score = score_of(results)
 
-    assert score.value == pytest.approx(0.4 / 0.6)
-    assert score.low < 0.4 / 0.6 < score.high
+    assert (score.value, score.n) == (pytest.approx(0.5), 3)
+    assert (score.measured, score.floor, score.optimum) == (pytest.approx(0.6), pytest.approx(0.2), 1)
+    assert score.low < 0.5 < score.high
 
 
-def test_equal_seeds_have_the_wide_exact_interval():
-    score = score_of([Measured(1.0, 0.25, 1.0)] * 5)
+def test_the_floor_is_the_control_with_the_best_mean():
+    results = [Measured(0.9, (0.2, 0.5), 1.0, exact=False), Measured(0.7, (0.6, 0.5), 1.0, exact=False)]
+
+    score = score_of(results, ("one", "another"))
+
+    assert (score.controls, score.floor) == ("one 0.40, another 0.50", 0.5)
+    assert score.value == pytest.approx((0.8 - 0.5) / 0.5)
+
+
+def test_equal_seeds_with_an_exact_floor_have_the_wide_exact_interval():
+    score = score_of([Measured(1.0, (0.25,), 1.0)] * 5)
 
     assert (score.value, score.high) == (1.0, 1.0)
     assert score.low == pytest.approx(-1 / 3 + 4 / 3 * 0.025 ** (1 / 5))
 
 
+def test_one_seed_has_no_interval():
+    assert score_of([Measured(1.0, (0.25,), 1.0)]).low is None
+
+
+def test_a_score_below_its_floor_is_0_and_its_interval_has_it():
+    score = score_of([Measured(0.1, (0.5, 0.4), 1.0, exact=False)] * 5, ("one", "another"))
+
+    assert (score.value, score.low) == (0.0, 0.0)
+    assert 0 < score.high < 1
+
+
+MEANS = ((0.9, 0.5, 0.3), (0.5, 0.5, 0.5), (0.95, 0.9, 0.2), (0.6, 0.2, 0.2))
+
+
+def drawn(rng, law, mean, size):
+    if law == "solve or fail":
+        return (rng.random(size) < mean).astype(float)
+    strength = 2.0 if law == "wide" else 20.0
+    return rng.beta(strength * mean, strength * (1 - mean), size)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("law", ["solve or fail", "wide", "narrow"])
+@pytest.mark.parametrize("means", MEANS)
+def test_the_interval_of_a_gain_covers_in_94_of_100_samples_of_five_seeds(law, means):
+    """A score lies above the lower end if one control allows it, and below the upper end if all do."""
+    rng = np.random.default_rng(0)
+    true = max(0.0, (means[0] - max(means[1:])) / (1 - max(means[1:])))
+    samples = 2000
+    covered = 0
+    for _ in range(samples):
+        own, *controls = (drawn(rng, law, mean, 5) for mean in means)
+        ends = [rest_of_gain(list(zip(own, control, strict=True)), true) for control in controls]
+        above = true == 0 or min(low for low, _ in ends) <= 0
+        covered += above and min(high for _, high in ends) >= 0
+
+    assert covered / samples >= 0.94
+
+
+def test_the_ends_of_the_interval_of_a_gain_are_the_last_scores_that_no_control_contradicts():
+    own = (1.0, 0.9, 1.0, 0.95, 1.0, 1.0, 1.0)
+    other = (0.1, 0.2, 0.0, 0.1, 0.0, 0.0, 0.1)
+    pairs = list(zip(own, other, strict=True))
+
+    score = score_of([Measured(a, (c,), 1.0, exact=False) for a, c in pairs], ("one",))
+
+    assert rest_of_gain(pairs, score.low)[0] == pytest.approx(0, abs=1e-4)
+    assert rest_of_gain(pairs, score.high)[1] == pytest.approx(0, abs=1e-4)
+    assert 0 < score.low < score.value < score.high < 1
+
+
+@pytest.mark.parametrize(("seeds", "shows"), [(5, False), (6, True)])
+def test_a_gain_is_above_0_from_six_seeds_on(seeds, shows):
+    score = score_of([Measured(1.0, (0.0,), 1.0, exact=False)] * seeds, ("one",))
+
+    assert (score.low > 0) == shows
+
+
+def test_the_last_blocks_of_the_lives_are_the_same_and_their_histories_equally_long():
+    loaded = [curricula.load(name) for name in (*LIVES, "profile_innate", "profile_roles")]
+
+    assert {life.blocks[-1] for life in loaded} == {loaded[0].blocks[-1]}
+    assert {sum(block.num_frames for block in life.blocks[:-1]) for life in loaded[1:]} == {49_152}
+    assert loaded[0].blocks[0].tasks == TARGETS
+    assert all(len(life.moments) * 8192 == life.num_frames for life in loaded)
+
+
+def shared(first, second):
+    """How many of their first decisions two goals share."""
+    return next((place for place, (a, b) in enumerate(zip(first, second, strict=False)) if a != b), len(first))
+
+
+@pytest.mark.parametrize(("name", "expected"), [("profile_similarity", 1), ("profile_dissimilar", 0)])
+def test_goals_before_share_the_first_decision_or_none(name, expected):
+    before, last = (block.tasks for block in curricula.load(name).blocks)
+
+    assert [shared(a.goal, b.goal) for a, b in zip(before, last, strict=True)] == [expected] * 2
+    assert [a.images for a in before] == [b.images for b in last]
+
+
+def test_in_other_roles_no_image_of_a_state_keeps_its_role():
+    known = curricula.load("profile_innate").blocks[0].tasks
+    others = curricula.load("profile_roles").blocks[0].tasks
+
+    for one, other in zip(known, others, strict=True):
+        kinds = ("wait_ids", "decision_ids", "end_ids")
+        roles = [{*range(ids[0], ids[1] + 1)} for ids in (getattr(one.observations, kind) for kind in kinds)]
+        now = [{*range(ids[0], ids[1] + 1)} for ids in (getattr(other.observations, kind) for kind in kinds)]
+        assert [a & b for a, b in zip(roles, now, strict=True)] == [set()] * 3
+        assert set.union(*roles) == set.union(*now)
+
+
+@pytest.mark.parametrize("name", ["profile_sparsity", "profile_adaptation", "profile_memory", "profile_fresh"])
+def test_goals_of_a_depth_take_each_branch_equally_often_at_each_place(name):
+    goals = {}
+    for task in curricula.load(name).tasks:
+        goals.setdefault(task.graph.depth, []).append(task.goal)
+
+    for of_depth in goals.values():
+        for place in zip(*of_depth, strict=True):
+            assert place.count(1) == place.count(2) > 0
+
+
 def test_a_recorded_run_is_scored_and_what_was_not_run_is_a_gap(tmp_path):
-    curriculum = curricula.load("profile_attention", num_frames=1024)
-    with Recorder(curriculum, tmp_path / "mine", about={"agent": "Mine"}) as recorder:
-        recorder.evaluate(lambda images: torch.zeros(len(images), dtype=torch.int64), 1024)
+    record(tmp_path / "mine", "profile_attention")
 
     scores = profile_scores([tmp_path])["Mine"]
 
-    assert (scores["attention"].value, scores["attention"].reason) == (0, "of profile_attention (modified)")
+    assert (scores["attention"].value, scores["attention"].measured, scores["attention"].floor) == (0, 0, 0.25)
     assert (scores["memory"].value, scores["memory"].reason) == (None, "there is no run")
 
 
 @pytest.mark.parametrize("order", [1, -1])
 def test_a_modified_curriculum_counts_where_the_published_one_has_no_score(tmp_path, order):
-    def record(name: str, finished: bool, **changes: int) -> Path:
-        curriculum = curricula.load("profile_attention", **changes)
-        with Recorder(curriculum, tmp_path / name, about={"agent": "Mine"}) as recorder:
-            if finished:
-                recorder.evaluate(lambda images: torch.zeros(len(images), dtype=torch.int64), curriculum.num_frames)
-        return tmp_path / name
-
-    modified = record("modified", True, num_frames=1024)
-    begun = record("begun", False)
-    published = record("published", True)
+    record(tmp_path / "modified", "profile_attention", num_frames=1024)
+    record(tmp_path / "begun", "profile_attention", moments=())
+    record(tmp_path / "published", "profile_attention", seed=1)
 
     reasons = []
-    for other in (begun, published):
-        reasons.append(profile_scores([modified, other][::order])["Mine"]["attention"].reason)
+    for other in ("begun", "published"):
+        folders = [tmp_path / "modified", tmp_path / other]
+        reasons.append(profile_scores(folders[::order])["Mine"]["attention"].reason)
     assert reasons == ["of profile_attention (modified)", ""]
+
+
+def test_a_seed_that_is_not_finished_leaves_a_gap_that_names_it_and_what_gives_it(tmp_path):
+    record(tmp_path / "whole", "profile_adaptation")
+    record(tmp_path / "half", "profile_adaptation", moments=(8192, 16384), seed=1)
+
+    score = profile_scores([tmp_path])["Mine"]["adaptation"]
+
+    assert score.value is None
+    assert f"{tmp_path / 'half'} has no results, unfinished" in score.reason
+    assert "give Recorder(curricula.load('profile_adaptation'), ...) all evaluations of its moments" in score.reason
+
+
+def test_blocks_that_were_evaluated_unequally_often_are_not_compared(tmp_path):
+    curriculum = curricula.load("profile_adaptation")
+    record(tmp_path / "uneven", "profile_adaptation", moments=(*curriculum.moments[:4], *curriculum.ends))
+
+    score = profile_scores([tmp_path])["Mine"]["adaptation"]
+
+    assert score.value is None
+    assert "uneven lacks the evaluation of task 1 after 49,152 frames" in score.reason
+
+
+def test_an_evaluation_too_many_is_named_too(tmp_path):
+    curriculum = curricula.load("profile_adaptation")
+    record(tmp_path / "uneven", "profile_adaptation", moments=(2048, *curriculum.moments))
+
+    score = profile_scores([tmp_path])["Mine"]["adaptation"]
+
+    assert score.value is None
+    assert "has one evaluation too many of task 1 after 2,048 frames" in score.reason
+
+
+def test_a_life_without_its_control_is_a_gap(tmp_path):
+    for name in ("profile_fresh", "profile_dissimilar", "profile_similarity"):
+        record(tmp_path / name, name)
+
+    whole = profile_scores([tmp_path])["Mine"]["similarity"]
+    record(tmp_path / "more", "profile_similarity", seed=1)
+    lacking = profile_scores([tmp_path])["Mine"]["similarity"]
+
+    assert (whole.value, whole.n) == (0, 1)
+    assert whole.controls == "profile_fresh 0.00, profile_dissimilar 0.00"
+    assert (lacking.value, lacking.n) == (None, 0)
+    assert "more lacks its control profile_fresh" in lacking.reason
+
+
+def test_a_run_of_an_earlier_version_is_not_scored(tmp_path):
+    record(tmp_path / "old", "profile_attention")
+    file = tmp_path / "old" / "curriculum.json"
+    content = json.loads(file.read_text(encoding="utf-8"))
+    old = curricula.load("profile_attention")
+    log = tmp_path / "old" / "run.jsonl"
+    from dataclasses import replace
+
+    first = replace(old, version=1)
+    file.unlink()
+    first.to_json(file)
+    log.write_text(log.read_text(encoding="utf-8").replace(old.fingerprint, first.fingerprint), encoding="utf-8")
+
+    reason = profile_scores([tmp_path])["Mine"]["attention"].reason
+
+    assert content["version"] == 2
+    assert "learned version 1 of profile_attention, the profile has version 2" in reason
+
+
+def test_lives_with_other_last_blocks_are_not_compared():
+    run = life("profile_similarity", lambda *life: 1)
+    other = life("profile_fresh", lambda *life: LATE)
+    shorter = other._replace(curriculum=curricula.load("profile_fresh", num_frames=49_152))
+
+    with pytest.raises(Undefined, match="ends with another block"):
+        measure(run, [shorter, other], PROPERTIES["profile_similarity"])
+
+
+def test_the_page_has_scores_and_what_was_measured_side_by_side(tmp_path):
+    pytest.importorskip("matplotlib")
+    record(tmp_path / "runs" / "mine", "profile_attention")
+
+    write_profile([tmp_path / "runs"], tmp_path / "out")
+
+    page = (tmp_path / "out" / "profile.md").read_text(encoding="utf-8")
+    assert "| attention | 0.00 |" in page
+    assert "| attention | 0.00, floor 0.25, optimum 1.00 |" in page
+    assert "Mine, model: there is no run" in page
+    with open(tmp_path / "out" / "profile.csv", newline="", encoding="utf-8") as file:
+        lines = {line["property"]: line for line in csv.DictReader(file)}
+    assert (lines["attention"]["score"], lines["attention"]["floor"]) == ("0.0", "0.25")
 
 
 @pytest.mark.slow
