@@ -48,7 +48,7 @@ CURVE = 12
 def profile_observability(num_frames: int = 819_200) -> Curriculum:
     """Property 1: four degrees of observability with random waits, two goals each, all at once.
 
-    They are the paper's CT-FO, CT-SU, CT-CO and CT-POSR with p = 0.5, where CT-SU and CT-POSR differ in images alone.
+    They are the paper's CT-FO, CT-SU, CT-CO and CT-POSR with p = 0.5, where CT-SU and CT-POSR differ only in images.
 
     Args:
         num_frames: frames of the eight tasks together.

@@ -1,7 +1,7 @@
 """How much of what comes next an agent's own model knows, on episodes of two policies that it did not choose.
 
 Half of the episodes are of a policy that acts at random, half of one that navigates: it waits where it must and decides
-at random. What the agent does itself does not matter.
+at random. The acts of the agent do not matter.
 """
 
 from __future__ import annotations
@@ -37,11 +37,14 @@ TOLERANCE = 1e-3
 """How far the sum of the probabilities of a row may be from 1."""
 
 
-class Known(NamedTuple):
+NO_MODEL = "has no model: its agent has no predict_next"
+
+
+class KnownBits(NamedTuple):
     """Bits a step, log2 K less those that a predictor needs, for K pairs of observation and reward."""
 
     value: float  # of the agent; a model that is worse than a uniform guess counts as one
-    memoryless: float  # of the best predictor that sees the observation and the action alone
+    memoryless: float  # of the best predictor that sees only the observation and the action
     exact: float  # of the exact model
     highest: float  # log2 K
 
@@ -55,7 +58,7 @@ class _Episodes(NamedTuple):
     runs: Tensor  # whether the step is of the first episode of its row, bool
 
 
-def known_bits(folder: Path, agent_class: Any, task: Task) -> Known:
+def known_bits(folder: Path, agent_class: Any, task: Task) -> KnownBits:
     """Return what the trained agent of a run knows.
 
     Args:
@@ -74,7 +77,7 @@ def known_bits(folder: Path, agent_class: Any, task: Task) -> Known:
         raise Undefined(str(error)) from error
     agent: Any = getattr(loaded, "unwrapped", loaded)  # without a method around it
     if not hasattr(agent, "predict_next"):
-        raise Undefined("has no model: its agent has no predict_next")
+        raise Undefined(NO_MODEL)
     try:
         return bits_of_model(agent, task)
     except ValueError as error:
@@ -82,7 +85,7 @@ def known_bits(folder: Path, agent_class: Any, task: Task) -> Known:
 
 
 @torch.no_grad()
-def bits_of_model(model: Model, task: Task) -> Known:
+def bits_of_model(model: Model, task: Task) -> KnownBits:
     """Return how much a model knows of a task's next observation and reward, and how much can be known.
 
     The values of the best memoryless predictor and of the exact model are means over the same steps of the probability
@@ -97,7 +100,7 @@ def bits_of_model(model: Model, task: Task) -> Known:
     """
     choices = _choices(task)
     tables = _tables(task, len(choices))
-    needed = torch.zeros(3, dtype=torch.float64)
+    needed = torch.zeros(3, dtype=torch.float64, device="cpu")
     num_steps = 0
     for policy in (RandomPolicy, NavigationPolicy):
         episodes = _episodes(task, policy, choices)
@@ -111,11 +114,11 @@ def bits_of_model(model: Model, task: Task) -> Known:
             own = log_probs.gather(1, came[:, None]).sum().item() / math.log(2)
             place = _place(task, episodes.seen[rows, : step + 1], history["action"])
             known = tables[:, place, came].log2().sum(1)
-            needed += -torch.stack([torch.tensor(own, dtype=torch.float64), *known])
+            needed += -torch.stack([torch.tensor(own, dtype=torch.float64, device="cpu"), *known])
             num_steps += len(rows)
     highest = math.log2(len(choices))
     own, memoryless, exact = (highest - needed / num_steps).tolist()
-    return Known(max(own, 0.0), memoryless, exact, highest)
+    return KnownBits(max(own, 0.0), memoryless, exact, highest)
 
 
 def _choices(task: Task) -> TensorDictBase:
@@ -125,7 +128,7 @@ def _choices(task: Task) -> TensorDictBase:
     plain = (task.goal_reward, task.fail_reward, task.step_reward, task.reward_std) == (1, 0, 0, 0)
     require((single and plain, "a model is scored on a surjective graph whose goal pays 1"))
     images = task.images.bank(0)[: x.last_id + 1]
-    rewards = torch.tensor([0.0, 1.0], dtype=torch.float32).repeat(len(images))
+    rewards = torch.tensor([0.0, 1.0], dtype=torch.float32, device="cpu").repeat(len(images))
     observations = images.repeat_interleave(2, 0)
     return TensorDict({"observation": observations, "reward": rewards}, [len(rewards)])
 
@@ -173,7 +176,7 @@ def _place(task: Task, seen: Tensor, action: Tensor) -> Tensor:
         action: [rows, steps].
     """
     depth = task.graph.depth
-    goal = torch.tensor(task.goal_decisions)
+    goal = torch.tensor(task.goal_decisions, dtype=torch.int64, device="cpu")
     decided = (seen == task.observations.decision_ids[0]) & (action != WAIT_ACTION)
     before = decided[:, :-1]
     level = before.sum(1)
@@ -197,7 +200,7 @@ def _tables(task: Task, num_pairs: int) -> Tensor:
     wait = 2 * x.wait_ids[0]
     decision = 2 * x.decision_ids[0]
     end = 2 * x.end_ids[0]
-    exact = torch.zeros(num_pairs // 2, 2, depth + 1, 2, num_pairs, dtype=torch.float64)
+    exact = torch.zeros(num_pairs // 2, 2, depth + 1, 2, num_pairs, dtype=torch.float64, device="cpu")
     exact[home, :, :, :, wait] = 1
     exact[decision // 2, 1, :, :, fail] = 1
     exact[decision // 2, 0, :, :, wait] = 1

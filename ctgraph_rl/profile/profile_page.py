@@ -104,7 +104,7 @@ def draw_profiles(scores: Profiles) -> Any:
         look = agent_style(position, agent)
         estimates = np.array([each[:3] for each in of_agent.values()], dtype=float)  # None is not a number
         places = numbers + (position + 0.5) * height - 0.4
-        _draw_bars(bars, places, height, estimates, look["color"], short(agent))
+        _draw_bars(bars, places, height, estimates, color=look["color"], label=short(agent))
     bars.set_yticks(numbers, [f"{number} {title}" for number, title in enumerate(titles, 1)])
     bars.set(xlim=(0, 1), xlabel="score", ylim=(len(titles) + 0.5, 0.5))
     figure.legend(loc="outside upper center", ncols=4)

@@ -35,7 +35,7 @@ HALVINGS = 20
 
 
 REPLACED = ("curriculum=", "seed=", "overwrite=")
-"""Settings of a run that a command says anew."""
+"""Settings of a run that a command gives again."""
 
 OF_AGENTS = ("policy_for", "initial_state", "learn", "load_state_dict")
 """Methods by which a class is known as one of an agent."""
@@ -98,7 +98,16 @@ def score_of(results: Sequence[Measured], controls: Sequence[str] = ()) -> Score
         low = min(max(found[0], 0.0), value)
         high = max(min(found[1], 1.0), value)
     said = ", ".join(f"{name} {mean:.2f}" for name, mean in zip(controls, means, strict=False))
-    return Score(value, low, high, len(results), "", measured, means[best], optimum, said)
+    return Score(
+        value,
+        low,
+        high,
+        n=len(results),
+        measured=measured,
+        floor=means[best],
+        optimum=optimum,
+        controls=said,
+    )
 
 
 def _exact_interval(results: Sequence[Measured]) -> tuple[float, float]:

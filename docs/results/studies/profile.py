@@ -161,7 +161,7 @@ def verdicts(found: dict[str, dict[str, Score]]) -> str:
         only = [title for title in mean[agent] if title not in certain[agent]]
         parts = [f"its interval is above the floor in {_listed(certain[agent])}"]
         if only:
-            parts.append(f"its mean alone in {_listed(only)}")
+            parts.append(f"only its mean in {_listed(only)}")
         lines.append(f"- **{AGENTS[agent]}** ({seeds} seeds): {'; '.join(parts)}.")
     return "\n".join(lines)
 
