@@ -98,7 +98,7 @@ class Model(Protocol):
         Args:
             history: what each row has met since its episode began, [rows, steps] in time order: ``observation``, the
                 ``action`` that followed, int64, and ``reward``, float32, that came with the observation, 0 with the
-                first. The result of the last action is to be predicted.
+                first. The method predicts the outcome of the last action.
             choices: all pairs that can come, [choices]: ``observation`` and ``reward``.
 
         Returns:

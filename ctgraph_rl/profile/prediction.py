@@ -1,7 +1,7 @@
 """How much of what comes next an agent's own model knows, on episodes of two policies that it did not choose.
 
 Half of the episodes are of a policy that acts at random, half of one that navigates: it waits where it must and decides
-at random. The acts of the agent do not matter.
+at random. The agent's own behaviour does not matter.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ TOLERANCE = 1e-3
 """How far the sum of the probabilities of a row may be from 1."""
 
 
-NO_MODEL = "has no model: its agent has no predict_next"
+MOST_LETTERS = 300
+"""Of a reason."""
 
 
 class KnownBits(NamedTuple):
@@ -63,25 +64,25 @@ def known_bits(folder: Path, agent_class: Any, task: Task) -> KnownBits:
 
     Args:
         folder: of the run.
-        agent_class: of an agent of the user; None for baselines.
+        agent_class: of its agent; None where it is not known.
         task: what it learned.
 
     Raises:
         Undefined: if it has no ``predict_next``, cannot be loaded, or gives no probabilities.
     """
+    no_model = "has no model: its agent has no predict_next"
+    if agent_class is not None and not hasattr(agent_class, "predict_next"):
+        raise Undefined(no_model)
     try:
         loaded = load(folder, agent_class).agent
+        agent: Any = getattr(loaded, "unwrapped", loaded)  # without a method around it
+        if not hasattr(agent, "predict_next"):
+            raise Undefined(no_model)
+        return bits_of_model(agent, task)
     except FileNotFoundError:
         raise Undefined("has no model: a Recorder stores no agent") from None
     except ValueError as error:
-        raise Undefined(str(error)) from error
-    agent: Any = getattr(loaded, "unwrapped", loaded)  # without a method around it
-    if not hasattr(agent, "predict_next"):
-        raise Undefined(NO_MODEL)
-    try:
-        return bits_of_model(agent, task)
-    except ValueError as error:
-        raise Undefined(str(error)) from error
+        raise Undefined(" ".join(str(error).split())[:MOST_LETTERS]) from error
 
 
 @torch.no_grad()

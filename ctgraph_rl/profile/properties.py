@@ -12,9 +12,8 @@ from torch import Tensor
 from ctgraph_rl.checks import by_name
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.metrics import Undefined
-from ctgraph_rl.packages import class_named
 from ctgraph_rl.profile.floors import all_found_share, best_without_memory, found_share
-from ctgraph_rl.profile.prediction import NO_MODEL, known_bits
+from ctgraph_rl.profile.prediction import known_bits
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import Task, ct_graphs
 from ctgraph_rl.tasks.values import open_loop_ceiling
@@ -36,7 +35,7 @@ class Evidence(NamedTuple):
     log: RunLog
     curriculum: Curriculum
     folder: Path
-    agent_class: Any = None  # of a user; None where it is not imported
+    agent_class: Any = None  # None where it is not known
 
     @property
     def tasks(self) -> Sequence[Task]:
@@ -159,11 +158,6 @@ def predicts(run: Evidence, controls: Sequence[Evidence]) -> Measured:
         Undefined: for an agent without ``predict_next``, and a log without its agent.
     """
     [task] = run.tasks
-    config = run.log.of_kind("run")[0].get("config") or {}
-    module, _, name = str((config.get("agent") or {}).get("_target_")).rpartition(".")
-    kind = run.agent_class or (class_named(module, name) if module.startswith("baselines.") else None)
-    if kind is not None and not hasattr(kind, "predict_next"):  # whether or not its weights can be loaded
-        raise Undefined(NO_MODEL)
     known = known_bits(run.folder, run.agent_class, task)
     return Measured(known.value, (known.memoryless,), known.exact, highest=known.highest)
 

@@ -21,7 +21,7 @@ from ctgraph_rl.log.files import CURRICULUM, LOG
 from ctgraph_rl.log.named_curricula import curriculum_named
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.metrics import Undefined
-from ctgraph_rl.packages import check_packages
+from ctgraph_rl.packages import check_packages, class_named
 from ctgraph_rl.profile.properties import Evidence, Measured, measure
 from ctgraph_rl.report.intervals import Bounds, gaffke
 from ctgraph_rl.report.names import displayed
@@ -35,7 +35,7 @@ HALVINGS = 20
 
 
 REPLACED = ("curriculum=", "seed=", "overwrite=")
-"""Settings of a run that a command gives again."""
+"""Settings of a run that a command replaces."""
 
 OF_AGENTS = ("policy_for", "initial_state", "learn", "load_state_dict")
 """Methods by which a class is known as one of an agent."""
@@ -99,9 +99,9 @@ def score_of(results: Sequence[Measured], controls: Sequence[str] = ()) -> Score
         high = max(min(found[1], 1.0), value)
     said = ", ".join(f"{name} {mean:.2f}" for name, mean in zip(controls, means, strict=False))
     return Score(
-        value,
-        low,
-        high,
+        value=value,
+        low=low,
+        high=high,
         n=len(results),
         measured=measured,
         floor=means[best],
@@ -312,7 +312,7 @@ def _evidence(run: Run) -> Evidence:
     lacking = _lacking(log, learned)
     if lacking:
         raise Undefined(f"{run.path} {lacking}: {_command(run)} overwrite=true")
-    return Evidence(log, learned, run.path, _imported_class(run))
+    return Evidence(log, learned, run.path, _agent_class(run))
 
 
 def _lacking(log: RunLog, curriculum: Curriculum) -> str:
@@ -341,10 +341,15 @@ def _command(run: Run, curriculum: str = "") -> str:
     return f"ctgraph-rl profile {shlex.join(words)}"
 
 
-def _imported_class(run: Run) -> Any:
-    """Return the class of a run's agent; None if its module is not imported, as nothing of a file is."""
+def _agent_class(run: Run) -> Any:
+    """Return the class of a run's agent; None where it is no baseline and its module is not imported.
+
+    Nothing that a file names is imported, but for baselines.
+    """
     agent = run.about["config"].get("agent")
     module, _, name = str(agent.get("_target_") if isinstance(agent, Mapping) else agent).rpartition(".")
+    if module.startswith("baselines."):
+        return class_named(module, name)
     kind = getattr(sys.modules.get(module), name, None)
     is_agent = isinstance(kind, type) and kind.__module__ == module and all(hasattr(kind, each) for each in OF_AGENTS)
     return kind if is_agent else None

@@ -7,22 +7,21 @@ import json
 import re
 import subprocess
 import sys
-from functools import partial
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from helpers.paths import CHECKOUT
 from helpers.profiles import LATE, life
 
 import curricula
 from ctgraph_rl import Recorder
 from ctgraph_rl.metrics import Undefined
-from ctgraph_rl.packages import conf_dir
 from ctgraph_rl.profile.profile_page import write_profile
 from ctgraph_rl.profile.properties import Measured, measure
 from ctgraph_rl.profile.scoring import profile_scores, rest_of_gain, score_of
-from curricula.profile import PROPERTIES, TARGETS
+from curricula.profile import NAMED, PROPERTIES, TARGETS
 
 LIVES = ("profile_fresh", "profile_unrelated", "profile_similarity", "profile_dissimilar", "profile_hierarchy")
 
@@ -242,8 +241,6 @@ def test_a_run_of_an_earlier_version_is_not_scored(tmp_path):
     content = json.loads(file.read_text(encoding="utf-8"))
     old = curricula.load("profile_attention")
     log = tmp_path / "old" / "run.jsonl"
-    from dataclasses import replace
-
     first = replace(old, version=1)
     file.unlink()
     first.to_json(file)
@@ -279,23 +276,103 @@ def test_the_page_has_scores_and_what_was_measured_side_by_side(tmp_path):
     assert (lines["attention"]["score"], lines["attention"]["floor"]) == ("0.0", "0.25")
 
 
-@pytest.mark.slow
-def test_the_command_trains_an_agent_of_the_user_scores_and_draws(tmp_path):
-    own = tmp_path / "conf" / "agent" / "mine.yaml"
-    own.parent.mkdir(parents=True)
-    (tmp_path / "mine.py").write_text("from baselines.ppo import PPO\nclass Mine(PPO):\n    pass\n")
-    ours = Path(conf_dir(), "agent", "ppo.yaml").read_text(encoding="utf-8")
-    own.write_text(ours.replace("baselines.ppo.PPO", "mine.Mine"), encoding="utf-8")
-    words = ["profile", "--config-dir", "conf", "agent=mine", "seed=0", "curriculum.num_frames=2048"]
+OWN_MODEL = """
+import torch
+from tensordict import TensorDict
+
+
+class Modeller:
+    def __init__(self, observation_spec, action_spec, num_envs, num_steps):
+        self.num_envs, self.num_steps = num_envs, num_steps
+
+    def policy(self, data):
+        return data.set("action", torch.randint(0, 3, data.batch_size))
+
+    def policy_for(self, task):
+        return self.policy
+
+    def initial_state(self, num_envs):
+        return TensorDict(batch_size=[num_envs])
+
+    def start_task(self, task=None):
+        pass
+
+    def end_task(self):
+        pass
+
+    def loss(self, batch):
+        return {"loss_none": torch.zeros(())}
+
+    def learn(self, batch):
+        return {}
+
+    def to(self, device):
+        return self
+
+    def state_dict(self):
+        return {}
+
+    def load_state_dict(self, state):
+        return self
+
+    def predict_next(self, history, choices):
+        return torch.full((len(history), len(choices)), -torch.tensor(float(len(choices))).log())
+"""
+"""An agent without a network or a state, whose policy is its method."""
+
+
+def profile_command(folder, *words):
     start = "from ctgraph_rl.cli import main; main()"
+    command = [sys.executable, "-P", "-c", start, "profile", *words]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True)  # where own modules are found
 
-    run = partial(subprocess.run, cwd=tmp_path, capture_output=True, text=True)  # where ``mine`` is found
-    (own.parent / "broken.yaml").write_text("- no agent")
-    done = run([sys.executable, "-P", "-c", start, *words])
-    scored = run([sys.executable, "-P", "-c", start, "profile", "--config-dir", "conf", "runs/profile"])
 
-    assert done.returncode == scored.returncode == 0, done.stderr + scored.stderr
+@pytest.mark.slow
+def test_the_command_trains_agents_of_the_user_scores_and_draws(tmp_path):
+    page = (CHECKOUT / "docs" / "how-to" / "own_agent.md").read_text(encoding="utf-8")
+    [code] = re.findall(r"`my_agent.py`:\n\n```python\n(.*?)```", page, re.DOTALL)
+    [config] = re.findall(r"```yaml\n(_target_: my_agent.MyAgent.*?)```", page, re.DOTALL)
+    agents = tmp_path / "conf" / "agent"
+    agents.mkdir(parents=True)
+    (tmp_path / "my_agent.py").write_text(code, encoding="utf-8")
+    (agents / "mine.yaml").write_text(config, encoding="utf-8")
+    (tmp_path / "my_model.py").write_text(OWN_MODEL, encoding="utf-8")
+    (agents / "model.yaml").write_text("_target_: my_model.Modeller\nnum_envs: 256\nnum_steps: 32\n", encoding="utf-8")
+
+    settings = ("curriculum=profile_model,profile_attention", "curriculum.num_frames=15360", "seed=0")
+    first = profile_command(tmp_path, "--config-dir", "conf", "agent=mine", *settings)
+    done = profile_command(tmp_path, "--config-dir", "conf", "agent=model", *settings)
+    (agents / "broken.yaml").write_text("- no agent", encoding="utf-8")
+    scored = profile_command(tmp_path, "--config-dir", "conf", "runs/profile")
+
+    assert first.returncode == done.returncode == scored.returncode == 0, first.stderr + done.stderr + scored.stderr
     assert scored.stdout.endswith(done.stdout[-200:])
     assert "left out: the agent of conf/agent/broken.yaml cannot be imported" in scored.stderr
-    assert re.search(r"model +0\.\d\d  \(of profile_model \(modified\)\)", done.stdout)
+    of_model = r"model +0\.00 +0\.00, floor 2\.44, optimum 2\.76  \(of profile_model \(modified\)\)"
+    assert re.search(of_model, done.stdout)
+    assert "has no model: its agent has no predict_next" in first.stdout
     assert (tmp_path / "runs" / "profile" / "profile" / "figures" / "profile.png").is_file()
+
+
+@pytest.mark.slow
+def test_the_command_runs_all_curricula_of_the_profile(tmp_path):
+    done = profile_command(tmp_path, "agent=ppo", "seed=0", "curriculum.num_frames=15360")
+
+    assert done.returncode == 0, done.stderr
+    assert len(list((tmp_path / "runs" / "profile").glob("profile_*/*/metrics.json"))) == len(NAMED)
+    assert len(re.findall(r"optimum", done.stdout)) == len(PROPERTIES) - 1
+
+
+@pytest.mark.slow
+def test_a_gap_of_a_killed_run_names_the_command_that_finishes_it(tmp_path):
+    words = ("agent=ppo", "curriculum=profile_model", "curriculum.num_frames=15360", "seed=0")
+    profile_command(tmp_path, *words)
+    [run] = (tmp_path / "runs" / "profile").glob("profile_model/*")
+    (run / "metrics.json").unlink()
+
+    [command] = re.findall(r"has no results, .*?: ctgraph-rl profile (.*?)\)", profile_command(tmp_path, "runs").stdout)
+    again = profile_command(tmp_path, *command.split())
+
+    assert command.startswith("agent=ppo curriculum.num_frames=15360 curriculum=profile_model seed=0 hydra.sweep.dir=")
+    assert again.returncode == 0, again.stderr
+    assert (run / "metrics.json").exists()
