@@ -162,6 +162,14 @@ def test_a_learner_that_is_no_faster_than_a_search_at_random_does_not_adapt(lear
 
 
 @pytest.mark.parametrize("name", LEARNED)
+def test_a_learner_that_solves_one_of_two_goals_scores_0(name):
+    def learner(curriculum, block, task):
+        return 1 if curriculum.name == name and curriculum.tasks[task].goal == (1, 2) else LATE
+
+    assert score_of_learner(name, learner).value == 0
+
+
+@pytest.mark.parametrize("name", LEARNED)
 def test_a_learner_that_only_what_came_before_lets_solve_the_last_block_scores_1(name):
     def learner(curriculum, block, task):
         return 1 if curriculum.name == name else LATE
