@@ -51,7 +51,8 @@ python_maximum_signature_line_length = 100
 napoleon_use_rtype = False
 OTHERS = "collections|fractions|gymnasium|matplotlib|numpy|os|pathlib|stable_baselines3|tensordict|torch|torchrl|types"
 SHORT_NAMES = (
-    "Path|Sequence|Span|Tensor|TensorDictBase|nn.Module|Rule|NamedValues|ReadOnlyValues|Items|Learnt|TensorsByName"
+    "NDArray|Path|Sequence|Span|Tensor|TensorDictBase|nn.Module|Rule|NamedValues|ReadOnlyValues|Items|Learnt"
+    "|TensorsByName"
 )
 nitpick_ignore_regex = [("py:.*", rf"({OTHERS})(\..*)?"), ("py:class", SHORT_NAMES)]
 

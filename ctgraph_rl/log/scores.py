@@ -86,7 +86,7 @@ def check_finished(log: RunLog, curriculum: Curriculum) -> None:
     """Refuse the log of a run without the last evaluation of its curriculum's protocol.
 
     Raises:
-        Undefined: says how far it came.
+        ctgraph_rl.metrics.Undefined: says how far it came.
     """
     reached = max((m["frames"] for m in log.of_kind("evaluation")), default=0)
     last = curriculum.moments[-1]
@@ -100,7 +100,7 @@ def protocol_curves(log: RunLog, curriculum: Curriculum) -> Curves:
     Areas, sums and maxima over evaluations of two runs compare only then.
 
     Raises:
-        Undefined: for another run; names the moments that are missing, or too many.
+        ctgraph_rl.metrics.Undefined: for another run; names the moments that are missing, or too many.
     """
     check_finished(log, curriculum)
     found = {m["frames"] for m in log.of_kind("evaluation") if not m.get("held_out")}

@@ -40,7 +40,7 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "ctgraph_rl.tasks.values",
             "ctgraph_rl.tasks.similarity",
             "ctgraph_rl.tasks.observability",
-            "ctgraph_rl.tasks.kinds.gym_spaces:ObservationForm",
+            "ctgraph_rl.tasks.kinds.gym_spaces:ObservationForm,Taken",
         ),
     ),
     "learning": (
