@@ -134,7 +134,7 @@ def profile() -> ArgumentParser:
     Settings are those of ctgraph-rl -m, such as agent=lstm_ppo seed=range(5). Cells use all cores, and the same command
     resumes. Runs go to runs/profile, and the page shows every agent there. Folders in place of settings only score the
     runs in them, those of a Recorder, too. A score is 0 at the floor of an agent without the property and 1 at the
-    optimum. One seed of agent=ppo takes about one CPU minute in all. The exit code is 1 if runs are not done or left
+    optimum. One seed of agent=ppo takes about 45 CPU seconds in all. The exit code is 1 if runs are not done or left
     out.
     """
     parser = _parser(profile)
