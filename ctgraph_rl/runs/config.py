@@ -65,7 +65,10 @@ SAID = (
         "{0} has several values: add -m to run each; a list is written in brackets, a text in quotes",
     ),
     (re.compile(r"Sweep parameters '(\S+?)=.*' requires --multirun"), "{0} has several values: add -m to run each"),
-    (re.compile(r"You must specify '(\S+)', e"), "{0}=??? names no file: name one, such as {0}=NAME, or leave {0} out"),
+    (
+        re.compile(r"(?:In '\S+': )?You must specify '(\S+)', e"),
+        "{0}=??? names no file: name one, such as {0}=NAME, or leave {0} out",
+    ),
     (
         re.compile(r"Config group override deletion value must be a string.*input_line='(.+?)'", re.DOTALL),
         "{0} removes a group by a value that no file of it has: leave {0} out",
