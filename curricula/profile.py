@@ -197,8 +197,8 @@ def profile_innate(num_frames: int = 98_304) -> Curriculum:
 def profile_roles(num_frames: int = 98_304) -> Curriculum:
     """Control of property 10: as `profile_innate`, but before its last block each image stands for another state.
 
-    What wait states show in the last block is shown by decision and end states before, and the other way round. An
-    agent that is slow wherever images are new is not slow here.
+    Images change their roles before the last block: those of wait states were shown by decision and end states, and the
+    other way round. An agent that is slow wherever images are new is not slow here.
 
     Args:
         num_frames: frames of the last goals together, a multiple of 24.

@@ -2,8 +2,8 @@
 
 Without noise on reading, an agent can have seen only finitely many things. A policy without memory is a table with a
 row for each image, whose values follow by backward induction (`ctgraph_rl.tasks.values`). With memory, all histories
-that do not end are played at once, each weighted by its probability: an action that fails ends an episode, so only
-waits at wait states, decisions at decision states, and drawn images branch.
+are played at once, each with its probability. An action that fails ends an episode. So histories branch only at
+decisions, at waits and where images are drawn.
 
 Where waits are drawn (p > 0), an episode may stay in a wait state for ever. Stays of a probability below `LEAST_STAY`
 are left out, which changes a success rate by less than (d + 1) times that.

@@ -99,7 +99,7 @@ def run_killed(monkeypatch, name: str, write: int, *settings: str) -> bool:
 
 
 def run_killed_for_good(monkeypatch, name: str, write: int, *settings: str) -> bool:
-    """The same by SIGKILL, in a process of its own."""
+    """The same by SIGKILL, in a separate process."""
     process = os.fork()
     if not process:
         DEATH.kill = lambda: os.kill(os.getpid(), signal.SIGKILL)

@@ -38,7 +38,7 @@ class Returns(gymnasium.Env):
 
 
 def task_of(name, **attributes):
-    """Return a task of an environment of its own, which ends after four steps."""
+    """Return a task whose environment ends after four steps."""
     kind = type(name, (Returns,), attributes)
     gymnasium.registry.pop(f"returns/{name}-v0", None)
     gymnasium.register(f"returns/{name}-v0", kind, max_episode_steps=4)
