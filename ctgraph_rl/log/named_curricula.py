@@ -28,7 +28,7 @@ def is_published(curriculum: Curriculum) -> bool | None:
         ValueError: see `check_packages`.
     """
     check_packages()
-    published = import_module("curricula")
-    if curriculum.name not in published.names():
-        return None
-    return published.load(curriculum.name).fingerprint == curriculum.fingerprint
+    for name, _, _, _, fingerprint, _ in import_module("curricula").listed():
+        if name == curriculum.name:
+            return bool(fingerprint == curriculum.fingerprint)
+    return None

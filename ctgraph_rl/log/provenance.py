@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Iterable, Iterator
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass
 from itertools import filterfalse
 from typing import Any
 
@@ -41,12 +41,6 @@ def versions() -> dict[str, str]:
     }
 
 
-def named(curriculum: Curriculum) -> Curriculum:
-    """Return the curriculum, with ``(modified)`` behind its name if another one is published under that name."""
-    modified = is_published(curriculum) is False
-    return replace(curriculum, name=f"{curriculum.name} (modified)") if modified else curriculum
-
-
 def provenance(curriculum: Curriculum, names: Iterable[str] | None = ()) -> NamedValues:
     """Return curriculum, code, versions and machine as plain values for JSON. Tasks are counted from 1.
 
@@ -54,9 +48,10 @@ def provenance(curriculum: Curriculum, names: Iterable[str] | None = ()) -> Name
         curriculum: what is learned.
         names: see `code`.
     """
+    modified = " (modified)" if is_published(curriculum) is False else ""
     return {
         "schema": SCHEMA,
-        "curriculum": named(curriculum).name,
+        "curriculum": f"{curriculum.name}{modified}",
         "version": curriculum.version,
         "source": curriculum.source,
         **code(curriculum, names),

@@ -400,5 +400,8 @@ def with_changes(curriculum: Curriculum, cfg: DictConfig) -> Curriculum:
     how = curriculum.protocol
     if protocol.get("task_id") == "hidden":
         how = replace(how, task_id="hidden", num_task_ids=None, task_ids=None)  # hidden ids have no length or numbers
+    how = changed("protocol", how, protocol)
     measured = changed("evaluation", curriculum.evaluation, config.changes_of(cfg, "evaluation"))
-    return replace(curriculum, evaluation=measured, protocol=changed("protocol", how, protocol))
+    if (how, measured) == (curriculum.protocol, curriculum.evaluation):
+        return curriculum
+    return replace(curriculum, evaluation=measured, protocol=how)

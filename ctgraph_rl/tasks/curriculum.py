@@ -7,7 +7,7 @@ import json
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from functools import cached_property
 from html import escape
 from itertools import accumulate
@@ -229,10 +229,10 @@ class Curriculum:
         """
         return read_curriculum(path_or_dict, cls)
 
-    @property
+    @cached_property
     def fingerprint(self) -> str:
         """16 hex digits that depend on everything but name and source, equal on every machine."""
-        content = _canonical(replace(self, name="-", source="-"))
+        content = {**_canonical(self), "name": "-", "source": "-"}
         text = json.dumps([FINGERPRINT_SCHEMA, content], sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
