@@ -17,7 +17,7 @@ from helpers.sweeping import command_line, files_in
 import curricula
 from baselines.lstm_ppo import LSTMPPO
 from ctgraph_rl import Block, CTGraphEnv, Curriculum, Protocol, RunLog, evaluate, packages
-from ctgraph_rl.log.provenance import NUMBERS, named
+from ctgraph_rl.log.provenance import NUMBERS, name_in_logs
 from ctgraph_rl.metrics import definitions
 from ctgraph_rl.run import run
 from ctgraph_rl.runs import job
@@ -147,6 +147,19 @@ def test_a_run_builds_one_agent_and_one_training_environment(compose, monkeypatc
     assert sorted(built, key=str) == [16, *[8] * 4, "agent"]  # an evaluation of 4 tasks after each of 4 blocks
 
 
+def test_a_run_builds_its_curriculum_once_and_writes_it_once(compose, monkeypatch, tmp_path):
+    built = []
+    written = []
+    prove = Curriculum.__post_init__
+    monkeypatch.setattr(Curriculum, "__post_init__", lambda self: built.append(self.name) or prove(self))
+    to_json = Curriculum.to_json
+    monkeypatch.setattr(Curriculum, "to_json", lambda self, path=None: written.append(self.name) or to_json(self, path))
+
+    job.run_job(compose(*SHORT), tmp_path)
+
+    assert (built, written) == (["su_b1_4tasks"], ["su_b1_4tasks"])
+
+
 def test_a_finished_run_is_shown_and_not_run_again(copy_of, compose, capsys, monkeypatch):
     monkeypatch.setattr(job, "learn", lambda *args: pytest.fail("ran again"))
     before = {name: (copy_of / name).read_bytes() for name in RESULTS}
@@ -255,10 +268,9 @@ def test_only_a_changed_curriculum_is_named_modified(compose):
     changed = target(compose("curriculum.image_seed=2"), "curriculum")()
     own = Curriculum("mine", 1, "here", published.blocks)
 
-    assert named(published) == published
-    assert named(changed).name == "su_b1_4tasks (modified)"
-    assert named(changed).fingerprint == changed.fingerprint
-    assert named(own) == own
+    assert name_in_logs(published) == "su_b1_4tasks"
+    assert name_in_logs(changed) == "su_b1_4tasks (modified)"
+    assert name_in_logs(own) == "mine"
 
 
 def test_a_refused_configuration_does_not_change_what_is_recorded_of_a_run(finished, monkeypatch, tmp_path):

@@ -41,6 +41,11 @@ def versions() -> dict[str, str]:
     }
 
 
+def name_in_logs(curriculum: Curriculum) -> str:
+    """Return a curriculum's name, with ``(modified)`` behind it if another one is published under that name."""
+    return f"{curriculum.name} (modified)" if is_published(curriculum) is False else curriculum.name
+
+
 def provenance(curriculum: Curriculum, names: Iterable[str] | None = ()) -> NamedValues:
     """Return curriculum, code, versions and machine as plain values for JSON. Tasks are counted from 1.
 
@@ -48,10 +53,9 @@ def provenance(curriculum: Curriculum, names: Iterable[str] | None = ()) -> Name
         curriculum: what is learned.
         names: see `code`.
     """
-    modified = " (modified)" if is_published(curriculum) is False else ""
     return {
         "schema": SCHEMA,
-        "curriculum": f"{curriculum.name}{modified}",
+        "curriculum": name_in_logs(curriculum),
         "version": curriculum.version,
         "source": curriculum.source,
         **code(curriculum, names),

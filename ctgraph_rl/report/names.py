@@ -31,7 +31,9 @@ def modifications(runs: Sequence[Run]) -> dict[str, str]:
 
 def modification(run: Run) -> str:
     """Return in words what of a run's curriculum differs from the published one; empty if that is unknown."""
-    learned = curriculum_of(run) if run.curriculum[0].endswith(MODIFIED) else None
+    if not run.curriculum[0].endswith(MODIFIED):
+        return ""
+    learned = curriculum_of(run)
     original = published(run.group[0])
     return "" if learned is None or original is None else ", ".join(_changes(original, learned))
 

@@ -11,7 +11,7 @@ from helpers.made_runs import write_run
 from rich.console import Console
 
 import curricula
-from ctgraph_rl.log.provenance import named
+from ctgraph_rl.log.provenance import name_in_logs
 from ctgraph_rl.report import formats, results
 from ctgraph_rl.report.figures.gallery import Gallery
 from ctgraph_rl.report.names import displayed, modifications
@@ -30,7 +30,7 @@ def run_of(folder, curriculum, *, has_file=True, seed=0, **more):
     """A finished run of a curriculum, with its file or without."""
     labels = curriculum.labels
     performance = [[float(task < block) for task in range(len(labels))] for block in range(len(labels) + 1)]
-    about = (named(curriculum).name, curriculum.fingerprint)
+    about = (name_in_logs(curriculum), curriculum.fingerprint)
     write_run(folder, curriculum=about, labels=labels, performance=performance, seed=seed, **more)
     if has_file:
         curriculum.to_json(folder / "curriculum.json")
