@@ -32,7 +32,7 @@ from torchrl.data import Composite, TensorSpec
 from baselines.cells.cell import linear_layer
 from baselines.parts.learner import reset_layer
 from baselines.parts.networks import Data, Items, TensorsByName, critic, encoder, highest
-from baselines.parts.policy_gradient import generalized_advantages
+from baselines.parts.policy_gradient import Seeds, generalized_advantages
 from baselines.ppo import PPO
 from baselines.update.update import make_optimiser, minimise
 from ctgraph_rl.checks import NamedValues, at_least_one, fraction, not_negative, positive, require, require_memory
@@ -219,10 +219,10 @@ class PPORND(PPO):
             yield minibatch
 
     @torch.no_grad()
-    def _with_advantage(self, batch: TensorDictBase) -> TensorsByName:
+    def with_advantage(self, batch: TensorDictBase, seeds: Seeds) -> TensorsByName:
         """Add the observations that the predictor learns from, and the targets of the bonus's critic."""
         advantage, target = self.bonus_advantages(batch)
-        given = super()._with_advantage(batch.copy().set("bonus_advantage", advantage))
+        given = super().with_advantage(batch.copy().set("bonus_advantage", advantage), seeds)
         return given | {"bonus_target": target, "next_observation": batch["next", "observation"]}
 
     def advantages(self, batch: TensorDictBase, *given: Tensor) -> tuple[Tensor, Tensor]:

@@ -17,6 +17,7 @@ from torch.nn.functional import one_hot
 from torchrl.data import Composite, TensorSpec
 
 from baselines.parts.networks import GROUP, Data, Items, RecurrentModule, TensorsByName, num_actions_of, recurrent
+from baselines.parts.policy_gradient import Seeds
 from baselines.ppo import PPO
 from ctgraph_rl.checks import at_least_one, require
 from ctgraph_rl.core.dynamics import OUTCOME_GOAL
@@ -147,8 +148,8 @@ class RL2(PPO):
         return batch[:, :-1].numel()
 
     @torch.no_grad()
-    def _with_advantage(self, batch: TensorDictBase) -> TensorsByName:
+    def with_advantage(self, batch: TensorDictBase, seeds: Seeds) -> TensorsByName:
         """Return all steps but the last; only the end of a trial ends the return."""
         after = batch["next"]
         ends = (after["done"] & (after["trial"] == self.trial_episodes))[:, :-1]
-        return self._with_estimates(batch[:, :-1], batch["state_value"][:, 1:], ends, ends)
+        return self.with_estimates(batch[:, :-1], batch["state_value"][:, 1:], ends, ends, seeds)

@@ -42,7 +42,8 @@ class Learner(TakesNumbers, nn.Module):
     """Whether earlier steps of an episode can change the action."""
 
     stackable: ClassVar[bool] = False
-    """Whether `loss` and `outputs` can be vectorised over seeds, see `baselines.update.seeds`; not with ``memory``."""
+    """Whether `loss` and `outputs` can be vectorised over seeds, see `baselines.update.seeds`; not with ``memory``. A
+    subclass that overrides what seeds share, such as `learn`, must set it again."""
 
     capturable: ClassVar[bool] = False
     """Whether a gradient step has no branch on data and keeps no new tensors, so that a CUDA graph can replay it."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -43,6 +44,18 @@ SMALLEST_DECAY = 1e-6
 """TorchRL's advantages leave out terms below 1e-7, and need at least one."""
 
 ACTED_KEYS = ("action", "action_log_prob", "state_value")
+
+
+class Seeds(NamedTuple):
+    """Whose rows a batch has: those of one agent, or the same number of each of several."""
+
+    count: int
+
+    values: Callable[[Items], Tensor]
+    """Computes the values, [n, 1], at n frames of all seeds, the same number of each."""
+
+    orders: Callable[[int], Tensor]
+    """Draws an order of so many items for each seed, int64 [seeds, items]; or for one, [items]."""
 
 
 class PolicyGradient(Learner):
@@ -194,34 +207,69 @@ class PolicyGradient(Learner):
 
     def minibatches(self, batch: TensorDictBase) -> Iterator[Items]:
         """Yield the minibatches of all epochs, with advantages from the values that were computed while acting."""
-        given = self._with_advantage(batch)
-        items = {key: value if self.memory else value.flatten(0, 1) for key, value in given.items()}
+        for minibatch in self.minibatches_of(batch, self.one_seed):
+            yield {key: value[0] for key, value in minibatch.items()}
+
+    def minibatches_of(self, batch: TensorDictBase, seeds: Seeds) -> Iterator[Items]:
+        """Yield the minibatches of several seeds, [seeds, frames or rows, ...] each; ``batch`` has all their rows."""
+        items = {}
+        for key, value in self.with_advantage(batch, seeds).items():
+            of_seeds = value.unflatten(0, (seeds.count, -1))
+            items[key] = of_seeds if self.memory else of_seeds.flatten(1, 2)
+        number = items["action"].shape[1]
+        first = number * torch.arange(seeds.count, device=items["action"].device).unsqueeze(1)
         for _ in range(self.num_epochs):
-            yield from self._minibatches(items)
+            places = (first + seeds.orders(number)).flatten()
+            parts = {}
+            for key, value in items.items():
+                shuffled = value.flatten(0, 1).index_select(0, places).view_as(value)
+                parts[key] = shuffled.chunk(self.num_minibatches, dim=1)
+            for part in range(len(parts["action"])):
+                yield {key: value[part] for key, value in parts.items()}
+
+    @property
+    def one_seed(self) -> Seeds:
+        """This agent alone."""
+        device = self.critic.module.weight.device
+        return Seeds(
+            1,
+            values=lambda data: self.one_step(data)["state_value"],
+            orders=lambda count: torch.randperm(count, device=device),
+        )
 
     def reward(self, batch: TensorDictBase) -> Tensor:
         """Return the reward to maximise, float32 [num_envs, num_steps, 1]: the environment's."""
         return batch["next", "reward"]
 
-    def _minibatches(self, items: TensorsByName) -> Iterator[TensorsByName]:
-        """Iterate over the minibatches of one epoch."""
-        order = torch.randperm(len(items["action"]), device=items["action"].device)
-        shuffled = [value.index_select(0, order).chunk(self.num_minibatches) for value in items.values()]
-        return (dict(zip(items, parts, strict=True)) for parts in zip(*shuffled, strict=True))
-
     @torch.no_grad()
-    def _with_advantage(self, batch: TensorDictBase) -> TensorsByName:
-        """Add ``advantage`` and ``value_target`` to a batch, from the values that were computed while acting."""
-        after = batch["next"]
-        return self._with_estimates(batch, self._next_values(batch), after["done"], after["terminated"])
+    def with_advantage(self, batch: TensorDictBase, seeds: Seeds) -> TensorsByName:
+        """Return inputs and actions of a batch, ``advantage`` and ``value_target``, [rows, steps, ...] each.
 
-    def _with_estimates(
-        self, batch: TensorDictBase, next_values: Tensor, done: Tensor, terminated: Tensor
+        The value after a step is that of the next step, computed while acting. It is computed anew after the last step
+        of the batch and where an episode was truncated; where one has terminated, it is not used.
+        """
+        values = batch["state_value"]
+        after = batch["next"]
+        cut = (after["done"] & ~after["terminated"]).squeeze(-1)
+        cut[:, -1] = True
+        next_values = values.roll(-1, dims=1)
+        if cut.is_cpu and seeds.count == 1:
+            next_values[cut] = seeds.values({key: after[key][cut] for key in self.trunk.in_keys})
+        else:  # a choice of frames would make the host wait for a GPU, and seeds differ in their number
+            computed = seeds.values({key: after[key].flatten(0, 1) for key in self.trunk.in_keys})
+            next_values = torch.where(cut.unsqueeze(-1), computed.view_as(values), next_values)
+        return self.with_estimates(batch, next_values, after["done"], after["terminated"], seeds)
+
+    def with_estimates(
+        self, batch: TensorDictBase, next_values: Tensor, done: Tensor, terminated: Tensor, seeds: Seeds
     ) -> TensorsByName:
-        """Return inputs, actions, advantages and value targets; each argument is [num_envs, num_steps, 1]."""
+        """Return what `with_advantage` does; values and flags are [rows, steps, 1]."""
         advantage, target = self.advantages(batch, next_values, done, terminated)
         if self.normalize_advantage:
-            advantage = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-8)
+            of_seeds = advantage.unflatten(0, (seeds.count, -1))
+            mean = of_seeds.mean(dim=(1, 2, 3), keepdim=True)
+            deviation = of_seeds.std(dim=(1, 2, 3), correction=0, keepdim=True)
+            advantage = ((of_seeds - mean) / (deviation + 1e-8)).flatten(0, 1)
         inputs = sequences_of(batch, [*self.trunk.in_keys, "action", "action_log_prob"])
         if self.deduplicate and advantage.is_cpu:
             inputs[GROUP] = self.trunk.groups(batch)
@@ -230,28 +278,9 @@ class PolicyGradient(Learner):
     def advantages(
         self, batch: TensorDictBase, next_values: Tensor, done: Tensor, terminated: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Compute the advantages and the critic's targets; each argument and result is [num_envs, num_steps, 1]."""
+        """Compute the advantages and the critic's targets; each argument and result is [rows, steps, 1]."""
         given = (batch["state_value"], next_values, self.reward(batch), done, terminated)
         return generalized_advantages(self.gamma, self.gae_lambda, *given)
-
-    def _next_values(self, batch: TensorDictBase) -> Tensor:
-        """Compute the value after each step: the next step's own, or that of another forward pass where there is none.
-
-        There is none after the last step of the batch and where an episode was truncated. Where one has terminated,
-        the value is not used.
-        """
-        values = batch["state_value"]
-        after = batch["next"]
-        cut = (after["done"] & ~after["terminated"]).squeeze(-1)
-        cut[:, -1] = True
-        next_values = values.roll(-1, dims=1)
-        if not cut.is_cpu:  # a choice of frames would make the host wait
-            ends = {key: after[key].flatten(0, 1) for key in self.trunk.in_keys}
-            of_ends = self.critic.module(self.trunk.act(ends)[self.features])
-            return torch.where(cut.unsqueeze(-1), of_ends.view_as(values), next_values)
-        ends = {key: after[key][cut] for key in self.trunk.in_keys}
-        next_values[cut] = self.critic.module(self.trunk.act(ends)[self.features])
-        return next_values
 
 
 def generalized_advantages(gamma: float, gae_lambda: float, *given: Tensor) -> tuple[Tensor, Tensor]:

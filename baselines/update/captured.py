@@ -15,10 +15,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from baselines.methods.method import Method
-from baselines.parts.learner import finite_means, table_of
-from baselines.parts.networks import Data, Items, TensorsByName, sequences_of
-from baselines.parts.policy_gradient import PolicyGradient
-from baselines.update.seeds import SeedGroup, learner_of, or_error, sampled, why_not_step
+from baselines.parts.learner import Learner, finite_means, table_of
+from baselines.parts.networks import Data, Items, TensorsByName
+from baselines.parts.policy_gradient import PolicyGradient, Seeds
+from baselines.update.seeds import SeedGroup, has_stackable, learner_of, or_error, sampled, why_not_step
 from baselines.update.stack import Stack
 from baselines.update.update import update
 from ctgraph_rl.agent import Agent
@@ -27,8 +27,8 @@ from ctgraph_rl.core.region import Region
 from ctgraph_rl.learn.collect import PREVIOUS_ACTION
 from ctgraph_rl.learn.loop import Learnt
 
-AS_EVER = ("learn", "gradient_step", "minibatches", "after_update", "after_batch", "one_step", "reward", "advantages")
-"""Methods of `PolicyGradient` that `CapturedGroup` has in its own form, for all seeds."""
+SHARED = ("learn", "gradient_step", "minibatches", "after_update", "one_step", "reward", "advantages")
+"""The members of an agent that act on all seeds at once, or that `CapturedGroup` does not call."""
 
 
 def why_not_captured(agent: Agent) -> str | None:
@@ -37,7 +37,7 @@ def why_not_captured(agent: Agent) -> str | None:
     name = type(learner).__name__
     if not isinstance(learner, PolicyGradient) or not learner.capturable:
         return f"{name} cannot be vectorised over seeds on a GPU"
-    if any(getattr(type(learner), own) is not getattr(PolicyGradient, own) for own in AS_EVER):
+    if not has_stackable(learner, SHARED):
         return f"{name} does not learn by the steps that a batch of seeds shares"
     method = type(learner.method)
     if method.acts_on_batches or getattr(method, "after_learning", None) not in (None, Method.after_learning):
@@ -177,51 +177,28 @@ class CapturedGroup(SeedGroup):
         """See `SeedGroup`; the host waits twice."""
         for method, part in zip(self.methods, batch.chunk(len(self.agents)), strict=False):
             method.on_batch(part)
-        items = self._items(batch)
         steps = []
-        for _ in range(self.first.num_epochs):
-            for minibatch in self._minibatches(items):
-                steps.append(self.gradient_step(self._transformed(minibatch)))
+        for minibatch in self.first.minibatches_of(batch, self.seeds):
+            steps.append(self.first.after_update(self.gradient_step(self._transformed(minibatch))))
         self.stack.write()
         columns = table_of(steps).cpu().unbind(2)
         weights = [self.stack.kept[name].detach().flatten(1) for name in self.stack.learned]
         largest = torch.stack([each.abs().amax(dim=1) for each in weights]).amax(dim=0).cpu()
-        return [or_error(finite_means, list(steps[0]), *each) for each in zip(columns, largest, strict=True)]
+        names = list(steps[0])
 
-    @torch.no_grad()
-    def _items(self, batch: TensorDictBase) -> TensorsByName:
-        """Return what the seeds learn from, [seeds, items, ...] each: frames, or with memory rows."""
-        after = batch["next"]
-        advantage, target = self.first.advantages(batch, self._next_values(batch), after["done"], after["terminated"])
-        if self.first.normalize_advantage:
-            advantage = self._normalised(advantage)
-        inputs = sequences_of(batch, [*self.first.trunk.in_keys, "action", "action_log_prob"])
-        items = {key: self.by_seed(value) for key, value in inputs.items()}
-        items |= {"advantage": self.by_seed(advantage), "value_target": self.by_seed(target)}
-        return items if self.first.memory else {key: value.flatten(1, 2) for key, value in items.items()}
+        def measured(learner: Learner, column: Tensor, largest_weight: Tensor) -> dict[str, float]:
+            return learner.after_batch(finite_means(names, column, largest_weight))
 
-    def _next_values(self, batch: TensorDictBase) -> Tensor:
-        """Compute the value after each step as `PolicyGradient` does, of all seeds."""
-        values = batch["state_value"]
-        after = batch["next"]
-        ends = {key: self.by_seed(after[key]).flatten(1, 2) for key in self.first.trunk.in_keys}
-        of_ends = self.stack.one_step(ends)["state_value"].view_as(values)
-        cut = after["done"] & ~after["terminated"]
-        cut[:, -1] = True
-        return torch.where(cut, of_ends, values.roll(-1, dims=1))
+        return [or_error(measured, *each) for each in zip(self.learners, columns, largest, strict=True)]
 
-    def _normalised(self, advantage: Tensor) -> Tensor:
-        """Give the advantages of each seed mean 0 and standard deviation 1."""
-        of_seeds = self.by_seed(advantage)
-        mean = of_seeds.mean(dim=(1, 2, 3), keepdim=True)
-        deviation = of_seeds.std(dim=(1, 2, 3), correction=0, keepdim=True)
-        return ((of_seeds - mean) / (deviation + 1e-8)).flatten(0, 1)
+    @property
+    def seeds(self) -> Seeds:
+        """What the minibatches of all agents are made with."""
+        return Seeds(len(self.agents), self._values, self.draws.orders)
 
-    def _minibatches(self, items: TensorsByName) -> Iterator[TensorsByName]:
-        """Iterate over the minibatches of one epoch, [seeds, items, ...] each."""
-        order = self.draws.orders(items["action"].shape[1])
-        for part in order.chunk(self.first.num_minibatches, dim=1):
-            yield {key: _taken(value, part) for key, value in items.items()}
+    def _values(self, data: Items) -> Tensor:
+        written = self.stack.one_step({key: self.by_seed(value) for key, value in data.items()})
+        return written["state_value"].flatten(0, 1)
 
     def _transformed(self, minibatch: TensorsByName) -> TensorsByName:
         """Return what the methods learn from in place of a minibatch."""
@@ -241,9 +218,3 @@ class CapturedGroup(SeedGroup):
     def _usual_update(self, minibatch: Data) -> TensorsByName:
         """Take the step, compiled where the agents are."""
         return (self.first.compiled_step or update)(self.first, self.stack.state, minibatch)
-
-
-def _taken(value: Tensor, items: Tensor) -> Tensor:
-    """Return items of each seed, int64 [seeds, n], of a tensor [seeds, items, ...]."""
-    first = torch.arange(len(value), device=value.device).unsqueeze(1) * value.shape[1]
-    return value.flatten(0, 1).index_select(0, (first + items).flatten()).unflatten(0, items.shape)

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torch._inductor import compile
 from torch.fx import GraphModule
 
@@ -42,21 +42,26 @@ def why_not_together(agent: Agent) -> str | None:
         return f"{name} with deduplicate=true cannot be vectorised over seeds"
     if not isinstance(learner, Learner) or not learner.stackable or learner.memory:
         return f"{name} cannot be vectorised over seeds"
-    if type(learner).learn is not Learner.learn or type(learner).gradient_step is not Learner.gradient_step:
+    if not has_stackable(learner, ("learn", "gradient_step")):
         return f"{name} does not learn by the steps that a batch of seeds shares"
     return why_not_step(learner)
 
 
 def why_not_step(learner: Learner) -> str | None:
     """Return why the steps of a learner's method and optimiser cannot be those of several seeds; None if they can."""
-    method = type(learner.method)
-    owner: Any = next(kind for kind in method.__mro__ if "stackable" in vars(kind))
-    if not owner.stackable or any(getattr(method, hook, None) is not getattr(owner, hook, None) for hook in HOOKS):
-        name = method.__name__
+    if not has_stackable(learner.method, HOOKS):
+        name = type(learner.method).__name__
         return f"{name} cannot be vectorised over seeds: its hooks take the weights of one seed"
     if has_parts(learner.optimiser):
         return None
     return f"{type(learner.optimiser).__name__} with these settings cannot be vectorised over seeds"
+
+
+def has_stackable(part: nn.Module, members: Sequence[str]) -> bool:
+    """Return whether a learner or method is ``stackable``, and none of these members newer than the class that says so."""
+    kind = type(part)
+    owner: Any = next(each for each in kind.__mro__ if "stackable" in vars(each))
+    return owner.stackable and all(getattr(kind, name, None) is getattr(owner, name, None) for name in members)
 
 
 class SeedGroup:

@@ -93,7 +93,7 @@ def test_advantages_equal_the_generalised_estimate_by_hand(small_agent, name):
     agent = small_agent(name, [ct_su_b1()], *HAND)
     batch = small_batch(agent)
 
-    learnt = agent._with_advantage(batch)
+    learnt = agent.with_advantage(batch, agent.one_seed)
 
     # Running on: 1 + 0.5 * 4 - 2 = 1, and (0 + 0.5 * 2 - 1) + 0.125 * 1 = 0.125.
     # Ended by the first step: 0 - 1 = -1, then as above. Ended by the last: 1 - 2 = -1, and 0 + 0.125 * -1 = -0.125.
@@ -108,7 +108,7 @@ def test_a_truncated_episode_counts_with_the_value_of_what_would_have_followed(s
     batch = small_batch(agent)
     batch["next", "terminated"] = torch.zeros_like(batch["next", "done"])
 
-    advantage = agent._with_advantage(batch)["advantage"]
+    advantage = agent.with_advantage(batch, agent.one_seed)["advantage"]
 
     # Cut after the first step: 0 + 0.5 * 4 - 1 = 1. Cut after the last: as if running on.
     expected = torch.tensor([[0.125, 1.0], [1.0, 1.0], [0.125, 1.0]]).unsqueeze(-1)
@@ -119,7 +119,7 @@ def test_reinforce_weighs_log_probabilities_by_the_return_less_the_baseline(smal
     agent = small_agent("reinforce", [ct_su_b1()], *TINY)
     batch = small_batch(agent)
 
-    learnt = agent._with_advantage(batch)
+    learnt = agent.with_advantage(batch, agent.one_seed)
 
     # Returns: 1 + 0.5 * 4 = 3 and 0.5 * 3; 0 and 3; 0.5 * 1 and 1.
     returns = torch.tensor([[1.5, 3.0], [0.0, 3.0], [0.5, 1.0]]).unsqueeze(-1)
@@ -152,7 +152,7 @@ def test_an_orthogonal_start_has_small_heads_and_no_biases(build_agent, again):
 def test_advantages_are_normalised_over_the_batch_where_configured(small_agent, name):
     agent = small_agent(name, [ct_su_b1()], "agent.normalize_advantage=true")
 
-    advantage = agent._with_advantage(batches(agent, ct_su_b1(), 1)[0])["advantage"]
+    advantage = agent.with_advantage(batches(agent, ct_su_b1(), 1)[0], agent.one_seed)["advantage"]
 
     assert advantage.mean().item() == pytest.approx(0, abs=1e-6)
     assert advantage.std(correction=0).item() == pytest.approx(1, abs=1e-4)
@@ -163,7 +163,7 @@ def test_one_step_of_one_row_is_normalised_to_zero(small_agent):
 
     agent.learn(batches(agent, ct_su_b1(), 1)[0])
 
-    assert agent._with_advantage(batches(agent, ct_su_b1(), 1)[0])["advantage"].item() == 0
+    assert agent.with_advantage(batches(agent, ct_su_b1(), 1)[0], agent.one_seed)["advantage"].item() == 0
 
 
 def test_lstm_ppo_learns_from_every_row_once_in_every_epoch(small_agent):

@@ -97,7 +97,7 @@ def test_the_return_goes_on_over_the_episodes_of_a_trial_and_ends_with_it(small_
     batch["next", "done"] = torch.tensor([False, True, False, False]).expand(2, 4).unsqueeze(-1).clone()
     batch["next", "trial"] = torch.tensor([[1, 1, 2, 2], [2, 2, 1, 1]]).unsqueeze(-1)
 
-    learnt = agent._with_advantage(batch)
+    learnt = agent.with_advantage(batch, agent.one_seed)
 
     # The value after the third step is 4. Going on: 0.5 * 4 = 2, then 1 + 0.5 * 2, then 0.5 * 2.
     # Where the trial ended after the second step: 2, then 1, then 0.5.

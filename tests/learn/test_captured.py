@@ -164,7 +164,7 @@ def test_neither_acting_nor_learning_of_several_seeds_needs_the_host(
             for _ in range(group.first.num_steps):
                 step, carried = act(carried)
                 steps.append(step)
-        minibatches = islice(group._minibatches(group._items(in_time_order(steps, env))), 2)
+        minibatches = islice(group.first.minibatches_of(in_time_order(steps, env), group.seeds), 2)
         measured = [group.gradient_step(minibatch) for minibatch in minibatches]
         group.stack.write()
 

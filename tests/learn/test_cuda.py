@@ -164,7 +164,7 @@ def test_several_seeds_learn_by_graphs_what_they_learn_step_by_step_and_never_wa
         measured = [group.learn(next(collected)) for _ in range(WARM_UP + 1)]
         if is_captured:
             with without_waiting():
-                for minibatch in group._minibatches(group._items(next(collected))):
+                for minibatch in group.first.minibatches_of(next(collected), group.seeds):
                     group.gradient_step(minibatch)
         return measured[0]
 

@@ -154,7 +154,7 @@ def test_eight_seeds_learn_from_what_each_would_alone_with_its_losses_and_gradie
     group = make(name, EIGHT, *overrides)
     compared = []
 
-    def compare(items, minibatch):
+    def compare(minibatch):
         state = group.stack.state
         losses = losses_of(group.first, state, minibatch)
         [gradient, *_] = torch.autograd.grad(total_loss(losses).sum(), state.weights)
@@ -166,14 +166,13 @@ def test_eight_seeds_learn_from_what_each_would_alone_with_its_losses_and_gradie
         compared.append(gradient)
 
     def learned(batch):
-        items = group._items(batch)
+        found = group.first.with_advantage(batch, group.seeds)
         for number, (agent, part) in enumerate(zip(group.learners, batch.chunk(8), strict=True)):
-            expected = agent._with_advantage(part)
-            for key, value in expected.items():
-                value = value if agent.memory else value.flatten(0, 1)
-                torch.testing.assert_close(items[key][number], value, rtol=1e-4, atol=1e-5)
+            expected = agent.with_advantage(part, agent.one_seed)
+            its = {key: value.chunk(8)[number] for key, value in found.items()}
+            torch.testing.assert_close(its, expected, rtol=1e-4, atol=1e-5)
         group.stack.write()
-        compare(items, next(group._minibatches(items)))
+        compare(next(group.first.minibatches_of(batch, group.seeds)))
         return CapturedGroup.learn(group, batch)
 
     monkeypatch.setattr(group, "learn", learned)

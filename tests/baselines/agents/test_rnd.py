@@ -79,7 +79,7 @@ def test_returns_of_the_bonus_go_over_the_ends_of_episodes_and_are_added_to_the_
     agent.novelty.bonus = lambda observations: bonus
     values, after = (agent.bonus_values(data) for data in (batch, batch["next"]))
 
-    given = agent._with_advantage(batch)
+    given = agent.with_advantage(batch, agent.one_seed)
 
     target = after[:, -1:]
     for step in reversed(range(8)):
@@ -87,7 +87,7 @@ def test_returns_of_the_bonus_go_over_the_ends_of_episodes_and_are_added_to_the_
     agent.bonus_coeff = 0.0
     torch.testing.assert_close(given["bonus_target"], target[:, :-1])
     torch.testing.assert_close(
-        given["advantage"], agent._with_advantage(batch)["advantage"] + 0.5 * (target[:, :-1] - values)
+        given["advantage"], agent.with_advantage(batch, agent.one_seed)["advantage"] + 0.5 * (target[:, :-1] - values)
     )
 
 
