@@ -229,7 +229,7 @@ class PolicyGradient(Learner):
 
     @property
     def one_seed(self) -> Seeds:
-        """This agent alone."""
+        """This agent, as the only seed."""
         device = self.critic.module.weight.device
         return Seeds(
             1,
@@ -245,8 +245,8 @@ class PolicyGradient(Learner):
     def with_advantage(self, batch: TensorDictBase, seeds: Seeds) -> TensorsByName:
         """Return inputs and actions of a batch, ``advantage`` and ``value_target``, [rows, steps, ...] each.
 
-        The value after a step is that of the next step, computed while acting. It is computed anew after the last step
-        of the batch and where an episode was truncated; where one has terminated, it is not used.
+        The value after a step is the one that was computed while acting at the next step. After the last step of the
+        batch, and where an episode was truncated, it is computed here. Where one has terminated, it is not used.
         """
         values = batch["state_value"]
         after = batch["next"]

@@ -58,7 +58,7 @@ def why_not_step(learner: Learner) -> str | None:
 
 
 def has_stackable(part: nn.Module, members: Sequence[str]) -> bool:
-    """Return whether a learner or method is ``stackable``, and no member is newer than the class that says so."""
+    """Return whether a learner or method is ``stackable``, and no member is newer than the class that sets it."""
     kind = type(part)
     owner: Any = next(each for each in kind.__mro__ if "stackable" in vars(each))
     return owner.stackable and all(getattr(kind, name, None) is getattr(owner, name, None) for name in members)
