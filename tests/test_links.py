@@ -35,7 +35,8 @@ WRITING = {
 """Functions and methods that write files or make folders, unless what they write into is in memory."""
 
 ALLOWED = {
-    ("ctgraph_rl.board.isolate", "os.open"): "reads a folder",
+    ("ctgraph_rl.board.isolate", "group.mkdir"): "a cgroup",
+    ("ctgraph_rl.board.isolate", "path.open"): "a file of a cgroup",
     ("ctgraph_rl.board.relearn", "run_dir.mkdir"): "in the folder of a process",
     ("ctgraph_rl.core.kernel", "folder.mkdir"): "the user's own cache, which no other can write to",
     ("ctgraph_rl.core.kernel", "tempfile.TemporaryDirectory"): "as above",

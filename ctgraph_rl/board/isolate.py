@@ -1,90 +1,133 @@
-"""The code of others in a separate process: limits of time, memory and disk, and what the system can close off.
+"""The code of others in bubblewrap, within limits of time, memory, disk and processes.
 
-bubblewrap closes off everything but the process's own folder; see `ctgraph_rl.board.bubblewrap`. Without it nothing
-runs. `Isolation` says what is open and what is not limited.
-``python -m ctgraph_rl.board.isolate`` is the first thing that runs in the new process: no module of others can be
-imported before its limits are set.
+https://github.com/containers/bubblewrap, 0.8 or newer. Inside are Python and the programs of the system, read-only, and
+one folder to write to. There is no network, no other process, no capability, no terminal and nothing that was open.
+libseccomp makes a filter of system calls for what name spaces leave open. Without these nothing runs.
+
+Memory is limited for all processes together: by a cgroup, made here or by systemd, else by a number of threads that
+have a share of the memory each. Where no way holds, nothing runs either.
 """
 
 from __future__ import annotations
 
-import json
+import ctypes
+import errno
 import math
 import os
-import runpy
+import re
+import shutil
 import signal
-import stat
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
-from typing import IO, NamedTuple
+from tempfile import TemporaryFile
+from typing import NamedTuple
 
-from ctgraph_rl.board import bubblewrap
-from ctgraph_rl.checks import LARGEST_INT, positive, require
+from ctgraph_rl.checks import positive, require
 from ctgraph_rl.disk import made_folder
 
-HERE = "ctgraph_rl.board.isolate"
+OLDEST = (0, 8)
+"""The first version of bubblewrap that has all options."""
 
-MOST_OUTPUT = 2**12
-"""Bytes of what a process printed that are shown: the last ones."""
+OPTIONS = (
+    *("--unshare-all", "--unshare-user", "--disable-userns", "--cap-drop", "ALL"),
+    *("--new-session", "--die-with-parent"),
+)
+"""New name spaces but no further ones, no capability, no terminal; the process ends when its watcher ends."""
 
-MOST_PROCESSES, MOST_FILES, MOST_DEPTH, MOST_OPEN = 256, 100_000, 64, 4096
-"""Processes at once, files in the folder, folders within each other there, and open files of a process."""
+SYSTEM = ("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32", "/etc/alternatives", "/etc/ld.so.cache")
+"""Programs and libraries."""
 
-MOST_THREADS = 1024
-"""Of all processes together, where the system holds users to a limit."""
+PACKAGES = ("ctgraph_rl", "baselines", "conf", "curricula", "hydra_plugins")
+"""Folders of our packages, beside each other."""
 
-SECONDS_BETWEEN_LOOKS = 0.2
-"""At the use of memory and disk."""
+GRAPHICS = ("nvidia*", "kfd", "dri")
+"""Devices of graphics cards, in ``/dev``."""
 
-SECONDS_TO_END = 5
-"""For the last words of a process that was killed."""
+OWN = {"/tmp": "tmp", "/dev/shm": "shm"}
+"""Folders to write to, and where they are in the folder of the process: what is written there is counted with it."""
 
 KEPT = ("PATH", "LANG", "LC_ALL", "TZ", "CC", "LD_LIBRARY_PATH", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")
 """Variables of the environment that a process is given; no other is."""
 
-PROC = Path("/proc")
+REFUSED = {
+    errno.EPERM: (
+        *("add_key", "bpf", "keyctl", "mq_open", "msgget", "perf_event_open", "ptrace", "request_key", "semget"),
+        *("syslog", "userfaultfd"),
+    ),
+    errno.ENOSYS: ("io_uring_setup", "memfd_create", "memfd_secret", "shmget"),
+}
+"""System calls by the error that they give: keyrings, debugging, the kernel's programs, memory outside of limits.
+
+Libraries take others where one is missing (ENOSYS).
+"""
+
+ALLOW, REFUSE = 0x7FFF0000, 0x00050000
+"""Actions, from linux/seccomp.h."""
+
+CGROUPS = Path("/sys/fs/cgroup")
+
+MOST_FILES, MOST_OPEN, MOST_THREADS = 100_000, 4096, 1024
+"""Files in the folder, open files of a process, and threads of all processes together."""
+
+LEAST_FREE = 10**9
+"""Bytes that stay free on the disk."""
+
+MOST_OUTPUT = 2**12
+"""Bytes of what a process printed that are shown: the last ones."""
+
+SECONDS_BETWEEN_LOOKS = 0.5
+"""At the folder of a process."""
+
+SECONDS_TO_START = 60
+
+CGROUP, SYSTEMD, THREADS = "a cgroup", "systemd", "threads"
+"""Ways to limit the memory of all processes together."""
 
 
 class Limits(NamedTuple):
-    """What a process may use."""
+    """What a process and all that it starts may use."""
 
     seconds: float  # of wall-clock time
-    memory: int  # bytes, of all its processes
+    memory: int  # bytes
     disk: int  # bytes, in its folder
+    threads: int = 1  # that it needs, at least; used where a number of threads limits memory
+
+    @property
+    def most_threads(self) -> int:
+        """Threads of all processes where each has a share of the memory: Python starts a few beside those of torch."""
+        return 4 + 2 * self.threads
 
 
 class Isolation(NamedTuple):
     """How the code of others is closed off here."""
 
     bubblewrap: str | None  # its version; None: it cannot be used
-    why_not: str | None  # why it cannot
+    why_not: str | None  # why it cannot, and what to install
+    memory: str | None  # how memory is limited, one of `CGROUP`, `SYSTEMD`, `THREADS`
     graphics: bool  # whether the code may use the graphics cards
-    is_root: bool
 
     def closed(self) -> list[str]:
         """Return what is closed off, a text for each thing."""
-        if self.bubblewrap is None:
-            return []
         inside = "it sees no files but its folder, the code, Python and the programs of the system"
         other = "no other process, socket, shared memory, keyring, device or terminal"
-        return [f"bubblewrap {self.bubblewrap}", "no network", inside, "it changes only its folder", other]
+        memory = f"memory limited for all its processes together, by {self.memory}"
+        return [f"bubblewrap {self.bubblewrap}", "no network", inside, "it changes only its folder", other, memory]
 
     def missing(self) -> list[str]:
         """Return a text for each thing that is not closed off or not limited."""
-        root = "the system holds root to no number of processes: a burst of them is stopped once it is seen"
         cards = "graphics cards: it may use all of their memory and of their driver"
+        kernel = "the kernel's own memory for it is not limited, such as buffers of pipes and sockets"
         return [
             "weaknesses of the kernel stay, and what the processor's caches tell of other programs",
             "it can see which files are opened in the folders that it reads (inotify)",
-            "the kernel's own memory for it is not limited, such as buffers of pipes and sockets; neither are files "
-            "that it removed and keeps in a socket",
-            f"memory, disk and processes are looked at {1 / SECONDS_BETWEEN_LOOKS:g} times a second",
-            *([root] if self.is_root else []),
+            f"the disk is looked at {1 / SECONDS_BETWEEN_LOOKS:g} times a second; files that it removed and has open "
+            f"count only where less than {LEAST_FREE:,} bytes stay free",
+            *([kernel] if self.memory == THREADS else []),
             *([cards] if self.graphics else []),
         ]
 
@@ -94,79 +137,155 @@ class Outcome(NamedTuple):
 
     code: int  # its exit status; negative for a signal
     stopped: str | None  # the limit that it broke
-    seconds: float
     output: str  # the end of what it printed
 
     @property
     def failure(self) -> str | None:
-        """Return in words why it did not end well; None if it did."""
+        """Why it did not end well, in words; None if it did."""
         if self.stopped is not None:
             return f"stopped: {self.stopped}"
         last = self.output.strip().splitlines()[-1:] or ["it printed nothing"]
         return None if self.code == 0 else f"ended with exit code {self.code}: {last[0]}"
 
 
-def isolation(folder: Path, graphics: bool = False) -> Isolation:
-    """Return what this system closes off, found by a process that tries.
+def isolation(folder: Path, limits: Limits, graphics: bool = False) -> Isolation:
+    """Return what this system closes off: a process inside, in each way to limit memory, has to answer.
 
     Args:
         folder: an existing directory for that process.
+        limits: of the processes that will run.
         graphics: whether the code of others may use the graphics cards.
     """
-    folder = _prepared(folder)
-    why_not = bubblewrap.why_not(folder, _environment(folder))
-    found = None if why_not is not None else ".".join(map(str, bubblewrap.version() or ()))
-    return Isolation(found, why_not, graphics, is_root=os.geteuid() == 0)
+    found = bubblewrap_version()
+    shown = ".".join(map(str, found or ()))
+    why_not = None
+    if sys.platform != "linux":
+        why_not = "bubblewrap needs Linux"
+    elif found is None or found < OLDEST:
+        there = "there is none" if found is None else f"this is {shown}"
+        why_not = f"it needs bubblewrap {'.'.join(map(str, OLDEST))} or newer, {there}: install the package bubblewrap"
+    elif _libseccomp() is None:
+        why_not = "it needs libseccomp 2, there is none: install the package libseccomp2"
+    if why_not is not None:
+        return Isolation(None, why_not, None, graphics)
+    said = []
+    for way in (CGROUP, SYSTEMD, THREADS):
+        if way == THREADS and os.geteuid() == 0:
+            said.append(f"{way}: the system holds root to no number of them, be an ordinary user")
+            continue
+        here = Isolation(shown, None, way, graphics)
+        try:
+            short = limits._replace(seconds=SECONDS_TO_START)
+            outcome = run_isolated([sys.executable, "-I", "-S", "-c", "print('inside')"], folder, short, here)
+        except OSError as error:
+            said.append(f"{way}: {error.strerror}")
+            continue
+        if (outcome.code, outcome.output) == (0, "inside\n"):
+            return here
+        said.append(f"{way}: {outcome.failure or 'it did not answer'}")
+    return Isolation(None, f"bubblewrap does not start here with limited memory: {'; '.join(said)}", None, graphics)
+
+
+def bubblewrap_version() -> tuple[int, ...] | None:
+    """Return the version of bubblewrap; None where there is none."""
+    path = shutil.which("bwrap")
+    if path is None:
+        return None
+    done = subprocess.run([path, "--version"], capture_output=True, text=True)
+    found = re.search(r"(\d+)\.(\d+)\.(\d+)", done.stdout)
+    return None if found is None else tuple(map(int, found.groups()))
 
 
 def run_isolated(
-    module: str,
-    arguments: Sequence[str],
+    command: Sequence[str],
     folder: Path,
     limits: Limits,
-    *,
     isolated: Isolation,
     paths: Sequence[Path] = (),
     variables: Mapping[str, str] | None = None,
-    watch: Callable[[], object] = lambda: None,
 ) -> Outcome:
-    """Run a module in a separate process, within limits, and leave none of its processes behind.
+    """Run a command in bubblewrap, within limits, and leave none of its processes behind.
 
     Args:
-        module: as of ``python -m``.
-        arguments: of the module.
+        command: with an absolute path of its program.
         folder: an existing directory, the only one that it may change; its working directory and its home.
         limits: what it may use.
         isolated: how it is closed off; what is open was agreed to.
-        paths: folders in which it finds more modules, after those that are installed.
+        paths: folders that it may read beside the system's and Python's.
         variables: of its environment, beside `KEPT`.
-        watch: is called several times a second.
 
     Raises:
-        ValueError: for a limit that is not positive, and without bubblewrap.
+        ValueError: for a limit that is not positive, and where `isolation` found none.
+        OSError: if no cgroup can be made.
     """
     require(
         *positive(seconds=limits.seconds, memory=limits.memory, disk=limits.disk),
-        (isolated.bubblewrap is not None, f"the code of others is not run: {isolated.why_not}"),
+        (isolated.why_not is None, f"the code of others is not run: {isolated.why_not}"),
     )
-    folder = _prepared(folder)
-    found_in = [str(path.resolve()) for path in paths]
-    spec = json.dumps([limits, found_in, module, *arguments])
-    command = [sys.executable, "-P", "-s", "-m", HERE, spec]
-    start = time.monotonic()
-    environment = {**_environment(folder), **(variables or {})}
-    with bubblewrap.program() as filtering:
-        command = bubblewrap.confined(command, folder, paths, filtering=filtering, graphics=isolated.graphics)
+    folder = folder.resolve()
+    for name in OWN.values():
+        made_folder(folder / name)
+    own = {"HOME": str(folder), "TMPDIR": str(folder / "tmp"), **(variables or {})}
+    groups = new_cgroups(limits.memory) if isolated.memory == CGROUP else []
+    try:
+        with system_calls() as filtering, TemporaryFile(dir=folder) as said:
+            inside = [*_limit_each(limits, isolated.memory == THREADS), *command]
+            closed = confined(inside, folder, paths, own, filtering=filtering, graphics=isolated.graphics)
+            process = subprocess.Popen(
+                [*_limit_together(limits, isolated.memory, groups), *closed],
+                cwd=folder,
+                stdin=subprocess.DEVNULL,
+                stdout=said,
+                stderr=subprocess.STDOUT,
+                pass_fds=(filtering,),
+                start_new_session=True,
+            )
+            try:
+                stopped = _wait(process, folder, limits)
+            finally:
+                if process.poll() is None:
+                    os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+            said.seek(max(0, said.seek(0, os.SEEK_END) - MOST_OUTPUT))
+            output = said.read().decode("utf-8", "replace")
+    finally:
+        _remove_cgroups(groups)
+        strip_privileges(folder)
+    if stopped is None and process.returncode in (-signal.SIGKILL, 128 + signal.SIGKILL):
+        stopped = f"it was killed, as where it uses more than {limits.memory:,} bytes of memory"
+    return Outcome(process.returncode, stopped, output)
+
+
+def _wait(process: subprocess.Popen[bytes], folder: Path, limits: Limits) -> str | None:
+    """Wait for a process; return the limit that it broke, None if it ended by itself within all of them."""
+    end = time.monotonic() + limits.seconds
+    while True:
         try:
-            with _process(command, folder, environment, (filtering,)) as process:
-                said = _Tail(process.stdout)
-                stopped = _watched(process, folder, limits, watch)
-                if stopped is not None:
-                    _kill(process)
-                code = process.wait()
-        finally:
-            strip_privileges(folder)
-    return Outcome(code, stopped, time.monotonic() - start, said.text())
+            process.wait(SECONDS_BETWEEN_LOOKS)
+        except subprocess.TimeoutExpired:
+            if time.monotonic() > end:
+                return f"it took longer than {limits.seconds:g} seconds"
+        broken = _why_too_much(folder, limits.disk)
+        if broken is not None or process.returncode is not None:
+            return broken
+
+
+def _why_too_much(folder: Path, disk: int) -> str | None:
+    """Return why a folder holds more than it may; None if it does not."""
+    closed = ["-type", "d", "(", "!", "-readable", "-o", "!", "-executable", ")", "-printf", "closed\n"]
+    command = ["find", str(folder), "-xdev", *closed, "-o", "-printf", "%b\n"]
+    blocks = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True).stdout.split()
+    if "closed" in blocks:
+        return "it made a folder that cannot be read"
+    if len(blocks) > MOST_FILES:
+        return f"it made more than {MOST_FILES:,} files"
+    if 512 * sum(map(int, blocks)) > disk:
+        return f"it wrote more than {disk:,} bytes"
+    return f"less than {LEAST_FREE:,} bytes of the disk stay free" if _free(folder) < LEAST_FREE else None
+
+
+def _free(folder: Path) -> int:
+    return shutil.disk_usage(folder).free
 
 
 def strip_privileges(folder: Path) -> None:
@@ -176,232 +295,179 @@ def strip_privileges(folder: Path) -> None:
     subprocess.run(command, env={"PATH": "/usr/bin:/bin"}, stderr=subprocess.DEVNULL)
 
 
-class _Tail(threading.Thread):
-    """Reads all that a process prints, and keeps the end."""
+def _limit_each(limits: Limits, shares_memory: bool) -> list[str]:
+    """Return the beginning of a command that limits each process, from the inside."""
+    import resource  # here: only POSIX systems have it
 
-    def __init__(self, pipe: IO[bytes] | None) -> None:
-        assert pipe is not None
-        super().__init__(daemon=True)
-        self._pipe = pipe
-        self._kept = b""
-        self.start()
-
-    def run(self) -> None:
-        """Read until no process has the other end."""
-        with suppress(OSError, ValueError):
-            while read := os.read(self._pipe.fileno(), 2**16):
-                self._kept = (self._kept + read)[-MOST_OUTPUT:]
-
-    def text(self) -> str:
-        """Return the end; what processes that have escaped still print is not waited for."""
-        self.join(SECONDS_TO_END)
-        return self._kept.decode("utf-8", "replace")
-
-
-def _prepared(folder: Path) -> Path:
-    """Return the path of a folder without links, with the folders in it that a process finds elsewhere."""
-    folder = folder.resolve()
-    for name in bubblewrap.OWN.values():
-        made_folder(folder / name)
-    return folder
-
-
-def _environment(folder: Path) -> dict[str, str]:
-    """Return the variables of a new process: no credentials, and its folder as its home."""
-    kept = {name: os.environ[name] for name in KEPT if name in os.environ}
-    package = Path(__file__).resolve().parents[2]
-    own = {"HOME": str(folder), "TMPDIR": str(folder / "tmp"), "PYTHONPATH": str(package)}
-    return {**kept, **own, "PYTHONDONTWRITEBYTECODE": "1"}
-
-
-@contextmanager
-def _process(
-    command: Sequence[str], folder: Path, environment: Mapping[str, str], opened: Sequence[int]
-) -> Iterator[subprocess.Popen[bytes]]:
-    """Start a process as the first of a new group and session; kill all of them however this ends.
-
-    It gets nothing that is open here but some descriptors, and prints into a pipe.
-    """
-    process = subprocess.Popen(
-        command,
-        cwd=folder,
-        env=dict(environment),
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        bufsize=0,
-        close_fds=True,
-        pass_fds=opened,
-        start_new_session=True,
-    )
-    try:
-        yield process
-    finally:
-        _kill(process)
-        process.wait()
-
-
-def _kill(process: subprocess.Popen[bytes]) -> None:
-    """Kill a process, those of its children that can be seen, and its group."""
-    started = [] if process.poll() is not None else [each for each, _ in _family(process.pid)]
-    with suppress(ProcessLookupError, PermissionError):
-        os.killpg(process.pid, signal.SIGKILL)
-    for each in started:
-        with suppress(ProcessLookupError, PermissionError):
-            os.kill(each, signal.SIGKILL)
-
-
-def _watched(process: subprocess.Popen[bytes], folder: Path, limits: Limits, watch: Callable[[], object]) -> str | None:
-    """Wait for a process; return the limit that it broke, None if it ended by itself."""
-    end = time.monotonic() + limits.seconds
-    while True:
-        try:
-            process.wait(SECONDS_BETWEEN_LOOKS)
-        except subprocess.TimeoutExpired:
-            broken = _broken(process.pid, folder, limits, time.monotonic() > end)
-            if broken is not None:
-                return broken
-            watch()
-        else:
-            return _broken(process.pid, folder, limits, False)
-
-
-def _broken(number: int, folder: Path, limits: Limits, is_late: bool) -> str | None:
-    """Return the limit that a process, those that it started or their folder break."""
-    family = list(_family(number))
-    try:
-        used = _used(folder)
-    except PermissionError:
-        used = _Used(strange="it closed its folder")
-    disk = used.disk + sum(_removed([each for each, _ in family]).values())
-    rules = {
-        f"it took longer than {limits.seconds:g} seconds": is_late,
-        f"it used more than {limits.memory:,} bytes of memory": sum(each for _, each in family) > limits.memory,
-        f"it wrote more than {limits.disk:,} bytes": disk > limits.disk,
-        f"it made more than {MOST_FILES:,} files": used.files > MOST_FILES,
-        str(used.strange): used.strange is not None,
-        f"it started more than {MOST_PROCESSES} processes": len(family) > MOST_PROCESSES,
-    }
-    return next((text for text, is_broken in rules.items() if is_broken), None)
-
-
-def _family(number: int) -> Iterator[tuple[int, int]]:
-    """Yield a process and all that it and those started, each with its memory in bytes; none where none is seen."""
-    parents: dict[int, list[tuple[int, int]]] = {}
-    for path in PROC.glob("[0-9]*") if PROC.is_dir() else ():
-        with suppress(OSError, ValueError, IndexError):
-            fields = (path / "stat").read_text(errors="replace").rpartition(")")[2].split()
-            memory = int(fields[21]) * os.sysconf("SC_PAGE_SIZE")
-            own = int(path.name)
-            parents.setdefault(number if own == number else int(fields[1]), []).append((own, memory))
-    waiting = [each for each in parents.get(number, ()) if each[0] == number]
-    while waiting:
-        found = waiting.pop()
-        yield found
-        waiting += [each for each in parents.get(found[0], ()) if each[0] != number]
-
-
-def _removed(processes: Sequence[int]) -> dict[tuple[int, int], int]:
-    """Return the bytes of files without a name that processes still have, each once, by device and number."""
-    found: dict[tuple[int, int], int] = {}
-    for process in processes if PROC.is_dir() else ():
-        with suppress(OSError):
-            for name in os.listdir(PROC / str(process) / "fd"):
-                with suppress(OSError):
-                    seen = os.stat(PROC / str(process) / "fd" / name)
-                    if stat.S_ISREG(seen.st_mode) and seen.st_nlink == 0:
-                        found[seen.st_dev, seen.st_ino] = seen.st_blocks * 512
-        with suppress(OSError, ValueError):
-            for line in (PROC / str(process) / "maps").read_text(errors="replace").splitlines():
-                if line.endswith(" (deleted)") and "/dev/zero" not in line:  # that is memory, and counted as such
-                    first, _, offset, device, inode, *_ = line.split()
-                    start, end = (int(part, 16) for part in first.split("-"))
-                    major, minor = (int(part, 16) for part in device.split(":"))
-                    key = os.makedev(major, minor), int(inode)
-                    found[key] = max(found.get(key, 0), int(offset, 16) + end - start)
+    seconds = math.ceil(limits.seconds) * (os.cpu_count() or 1)
+    wanted = {"FSIZE": limits.disk, "CPU": seconds, "CORE": 0, "NOFILE": MOST_OPEN}
+    if shares_memory:
+        wanted |= {"NPROC": limits.most_threads, "AS": limits.memory // limits.most_threads}
+    found = ["prlimit"]
+    for name, value in wanted.items():
+        hard = resource.getrlimit(getattr(resource, f"RLIMIT_{name}"))[1]
+        most = value if hard == resource.RLIM_INFINITY else min(value, hard)
+        found.append(f"--{name.lower()}={most}")
     return found
 
 
-class _Used(NamedTuple):
-    """What a folder holds."""
+def _limit_together(limits: Limits, way: str | None, groups: Sequence[Path]) -> list[str]:
+    """Return the beginning of a command that limits the memory of all processes, from the outside."""
+    if way == SYSTEMD:
+        user = [] if os.geteuid() == 0 else ["--user"]
+        values = (f"MemoryMax={limits.memory}", "MemorySwapMax=0", f"TasksMax={MOST_THREADS}")
+        return ["systemd-run", *user, "--scope", "--quiet", "--collect", *(f"--property={each}" for each in values)]
+    found: list[str] = []
+    for group in groups:
+        found += ["sh", "-c", 'echo $$ > "$0" && exec "$@"', str(group / "cgroup.procs")]
+    return found
 
-    disk: int = 0  # bytes
-    files: int = 0  # counted a little beyond `MOST_FILES`
-    strange: str | None = None  # what was made there that hides files from this count
+
+def new_cgroups(memory: int) -> list[Path]:
+    """Make the cgroups of a process with limits, within those of this process; there are two in version 1.
+
+    Raises:
+        OSError: where none can be made, or one lacks a limit.
+    """
+    own = _own_cgroups()
+    if "memory" in own:
+        values = {
+            CGROUPS / "memory" / own["memory"]: {
+                "memory.limit_in_bytes": memory,
+                "memory.memsw.limit_in_bytes": memory,
+            },
+            CGROUPS / "pids" / own.get("pids", ""): {"pids.max": MOST_THREADS},
+        }
+    else:
+        home = CGROUPS / own.get("", "")
+        _set(home / "cgroup.subtree_control", "+memory +pids")
+        whole = {"memory.max": memory, "memory.swap.max": 0, "memory.oom.group": 1, "pids.max": MOST_THREADS}
+        values = {home: whole}
+    made: list[Path] = []
+    try:
+        for home, files in values.items():
+            group = home / f"ctgraph_rl-{os.getpid()}-{time.monotonic_ns()}"
+            group.mkdir()
+            made.append(group)
+            for name, value in files.items():
+                _set(group / name, value)
+    except OSError:
+        _remove_cgroups(made)
+        raise
+    return made
 
 
-def _used(folder: int | Path, depth: int = 0, files: int = 0) -> _Used:
-    """Return what a folder holds, and all in it; paths there may be longer than the system takes.
+def _own_cgroups() -> dict[str, str]:
+    """Return the paths of the cgroups of this process by their controllers, that of version 2 by an empty text."""
+    own = {}
+    for line in Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines():
+        _, controllers, path = line.split(":", 2)
+        own[controllers] = path.removeprefix("/")
+    return own
+
+
+def _set(path: Path, value: object) -> None:
+    """Write a value into a file that is there."""
+    with path.open("r+", encoding="ascii") as file:
+        file.write(str(value))
+
+
+def _remove_cgroups(groups: Sequence[Path]) -> None:
+    """Remove cgroups, once the last of their killed processes is gone."""
+    end = time.monotonic() + SECONDS_TO_START
+    for group in groups:
+        while True:
+            try:
+                group.rmdir()
+                break
+            except OSError:
+                if time.monotonic() > end:
+                    raise
+                time.sleep(0.01)
+
+
+def confined(
+    command: Sequence[str],
+    folder: Path,
+    paths: Sequence[Path],
+    variables: Mapping[str, str],
+    *,
+    filtering: int,
+    graphics: bool = False,
+) -> list[str]:
+    """Return the command that runs another one inside.
 
     Args:
-        folder: its path, or its descriptor.
-        depth: of folders above it.
-        files: that were counted before.
+        command: the other one.
+        folder: an absolute path, the only folder that it may change; its working directory.
+        paths: folders that it may read beside the system's and Python's.
+        variables: of its environment, beside `KEPT`.
+        filtering: the open file of `system_calls`.
+        graphics: whether it may use the graphics cards.
+
+    Raises:
+        ValueError: for a path that would show all files.
     """
-    disk = 0
-    strange = None
-    if depth > MOST_DEPTH:
-        return _Used(disk, files, f"it made more than {MOST_DEPTH} folders within each other")
-    with os.scandir(folder) as entries:
-        for entry in entries:
-            files += 1
-            with suppress(OSError):
-                disk += entry.stat(follow_symlinks=False).st_blocks * 512
-                if entry.is_dir(follow_symlinks=False):
-                    below = _opened(entry, folder, depth, files)
-                    disk = disk + below.disk
-                    files = below.files
-                    strange = strange or below.strange
-            if files > MOST_FILES or strange is not None:
-                break
-    return _Used(disk, files, strange)
+    wrong = [str(path) for path in paths if Path(os.path.realpath(path)) == Path("/")]
+    require((not wrong, "the code of others must be in a folder below /, got /"))
+    kept = {name: os.environ[name] for name in KEPT if name in os.environ}
+    made = ["env", "-i"]  # of bubblewrap, too: those inside can read its variables
+    for name, value in {**kept, **variables}.items():
+        made.append(f"{name}={value}")
+    made += [str(shutil.which("bwrap")), *OPTIONS, "--seccomp", str(filtering), "--proc", "/proc", "--dev", "/dev"]
+    for path in map(Path, SYSTEM):
+        if path.is_symlink():
+            made += ["--symlink", os.readlink(path), str(path)]
+        elif path.exists():
+            made += ["--ro-bind", str(path), str(path)]
+    for device in sorted(chain(*map(Path("/dev").glob, GRAPHICS))) if graphics else ():
+        made += ["--dev-bind", str(device), str(device)]
+    for place, name in OWN.items():
+        made += ["--bind", str(folder / name), place]
+    for each in _needed(paths):
+        made += ["--ro-bind", each, each]
+    made += ["--bind", str(folder), str(folder), "--chdir", str(folder)]
+    for place in ("/proc", "/dev", "/"):
+        made += ["--remount-ro", place]
+    return [*made, "--", *command]
 
 
-def _opened(entry: os.DirEntry[str], folder: int | Path, depth: int, files: int) -> _Used:
-    """Return what a folder within another one holds; see `_used`."""
-    within = folder if isinstance(folder, int) else None
-    name = entry.name if within else entry.path
+def _needed(paths: Sequence[Path]) -> list[str]:
+    """Return what Python and our packages are read from, and given folders, those that hold others first."""
+    sites = [path for path in sys.path if Path(path).name in ("site-packages", "dist-packages")]
+    named: list[str | Path] = [*paths, sys.prefix, sys.base_prefix, *sites, *(home() / name for name in PACKAGES)]
+    both = {*map(os.path.abspath, named), *map(os.path.realpath, named)}
+    return sorted(path for path in both if os.path.isdir(path) and not Path(path).is_relative_to("/usr"))
+
+
+def home() -> Path:
+    """Return the folder that holds our packages."""
+    return Path(__file__).resolve().parents[2]
+
+
+def _libseccomp() -> ctypes.CDLL | None:
+    """Return https://github.com/seccomp/libseccomp; None where there is none."""
     try:
-        opened = os.open(name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=within)
-    except PermissionError:
-        return _Used(0, files, "it made a folder that cannot be read")
-    try:
-        return _used(opened, depth + 1, files)
-    finally:
-        os.close(opened)
+        return ctypes.CDLL("libseccomp.so.2")
+    except OSError:
+        return None
 
 
-# what runs in the new process
-
-
-def main() -> None:
-    """Set the limits, and run the module that the first argument names, with its arguments."""
-    limits, paths, *called = json.loads(sys.argv[1])
-    _limit(Limits(*limits))
-    # not before: Python imports a sitecustomize that it finds, and modules of these names in place of those of Python
-    sys.path += paths
-    os.environ["PYTHONPATH"] = os.pathsep.join([os.environ["PYTHONPATH"], *paths])
-    sys.argv = called
-    runpy.run_module(called[0], run_name="__main__", alter_sys=True)
-
-
-def _limit(limits: Limits) -> None:
-    """Set the limits that the system holds, of this process and of each that it starts."""
-    import resource  # here: only POSIX systems have it
-
-    wanted = {
-        resource.RLIMIT_DATA: limits.memory,
-        resource.RLIMIT_FSIZE: limits.disk,
-        resource.RLIMIT_CPU: math.ceil(limits.seconds) * (os.cpu_count() or 1),
-        resource.RLIMIT_CORE: 0,
-        resource.RLIMIT_NOFILE: MOST_OPEN,
-        resource.RLIMIT_NPROC: MOST_THREADS,
-    }
-    for kind, value in wanted.items():
-        hard = resource.getrlimit(kind)[1]
-        most = min(value, LARGEST_INT if hard == resource.RLIM_INFINITY else hard)
-        resource.setrlimit(kind, (most, most))
-
-
-if __name__ == "__main__":
-    main()
+@contextmanager
+def system_calls() -> Iterator[int]:
+    """Open a file with the filter of system calls, as the library writes it for this machine."""
+    library = _libseccomp()
+    assert library is not None
+    library.seccomp_init.restype = ctypes.c_void_p
+    program = ctypes.c_void_p(library.seccomp_init(ALLOW))
+    with TemporaryFile() as file:
+        for error, names in REFUSED.items():
+            for name in names:
+                number = library.seccomp_syscall_resolve_name(name.encode())
+                failed = library.seccomp_rule_add_array(program, REFUSE | error, number, 0, None)
+                require((failed == 0, f"this libseccomp does not know the system call {name}: install a newer one"))
+        failed = library.seccomp_export_bpf(program, file.fileno())
+        library.seccomp_release(program)
+        require((failed == 0, "libseccomp cannot write a filter of system calls for this machine"))
+        file.seek(0)
+        yield file.fileno()

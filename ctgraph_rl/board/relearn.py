@@ -1,11 +1,13 @@
 """What runs in a separate process: runs are learned again, from a configuration or by the code of others.
 
-``python -m ctgraph_rl.board.relearn JOB.json`` writes a run directory for each seed into the working directory.
+``python -m ctgraph_rl.board.relearn JOB.json [CODE ...]`` writes a run directory for each seed into the working
+directory; modules of others are looked for in the folders CODE, after all that are installed.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from importlib import import_module
@@ -100,4 +102,6 @@ def _call(job: Relearning, run_dir: Path) -> None:
 
 
 if __name__ == "__main__":
+    sys.path += sys.argv[2:]
+    os.environ["PYTHONPATH"] = os.pathsep.join([os.environ.get("PYTHONPATH", ""), *sys.argv[2:]])
     learn_again(Relearning.read(Path(sys.argv[1])), Path.cwd())

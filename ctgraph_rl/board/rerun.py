@@ -11,19 +11,20 @@ import hashlib
 import os
 import platform
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+import sys
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from itertools import zip_longest
 from pathlib import Path
 from typing import NamedTuple
 
-from ctgraph_rl.board.isolate import Isolation, Limits, Outcome, run_isolated
+from ctgraph_rl.board.isolate import Isolation, Limits, Outcome, home, run_isolated
 from ctgraph_rl.board.relearn import Relearning, run_dir_of
 from ctgraph_rl.board.rescore import NO_ROW, Check, differing, equal
 from ctgraph_rl.board.submission import Submission, SubmittedRun, counted, experts_of, log_sum
 from ctgraph_rl.board.two_samples import compare_samples
-from ctgraph_rl.checks import ReadOnlyValues, are_ints, is_int, require
-from ctgraph_rl.disk import made_folder, open_own, read_text, require_no_link, write_whole
+from ctgraph_rl.checks import ReadOnlyValues, are_ints, require
+from ctgraph_rl.disk import made_folder, read_text, require_no_link, write_whole
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CURRICULUM, FAILURE, LOG, METRICS, MOST_BYTES_OF_A_REASON
 from ctgraph_rl.log.provenance import machine, numbers_of, versions
@@ -33,7 +34,6 @@ from ctgraph_rl.log.scores import scores
 from ctgraph_rl.parsers import LEVELS
 from ctgraph_rl.portable import VARIABLES, cpu_model
 from ctgraph_rl.runs.read import split_by
-from ctgraph_rl.strict import json_value
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.curriculum_json import file_text
 
@@ -42,9 +42,6 @@ RERUN = LEVELS[1]
 MODULE = "ctgraph_rl.board.relearn"
 
 JOB = "job.json"
-
-TAIL = 2**14
-"""Bytes at the end of a log in which progress is looked for."""
 
 SCORE = "average_performance"
 """The metric that is compared where a track does not name its own."""
@@ -82,11 +79,6 @@ class RerunCell(NamedTuple):
     def is_finished(self) -> bool:
         """Whether all seeds have results."""
         return all((run_dir / METRICS).is_file() for run_dir in self.run_dirs)
-
-    @property
-    def frames(self) -> int:
-        """Frames that all seeds have learned from so far."""
-        return sum(map(_frames, self.run_dirs))
 
 
 class Rerun(NamedTuple):
@@ -165,25 +157,18 @@ def job_of(
     return Relearning(seeds, together, submission.config, run.num_threads, entry_point=entry, curriculum=path)
 
 
-def learn_again(
-    cell: RerunCell,
-    limits: Limits,
-    isolated: Isolation,
-    paths: Sequence[Path] = (),
-    watch: Callable[[], object] = lambda: None,
-) -> Outcome:
+def learn_again(cell: RerunCell, limits: Limits, isolated: Isolation, code: Sequence[Path] = ()) -> Outcome:
     """Learn a cell in a separate process; one that was stopped before is resumed where its learner can be.
 
     Args:
         cell: what to learn.
         limits: of the process.
         isolated: how it is closed off.
-        paths: folders with the code of others.
-        watch: is called several times a second.
+        code: folders with the code of others.
     """
     made_folder(cell.folder)
     if cell.is_finished:
-        return Outcome(0, None, 0.0, "")
+        return Outcome(0, None, "")
     if cell.job.entry_point is not None:
         for run_dir in cell.run_dirs:
             try:
@@ -191,20 +176,18 @@ def learn_again(
             except RecursionError:
                 fix = "has too many folders within each other to remove: rm -r it yourself"
                 raise ValueError(f"{run_dir} {fix}") from None
-    _with_its_curriculum(cell).write(cell.folder / JOB)
-    variables = VARIABLES if is_portable(cell.job.config) else {}
-    return run_isolated(
-        MODULE, [JOB], cell.folder, limits, isolated=isolated, paths=paths, variables=variables, watch=watch
-    )
-
-
-def _with_its_curriculum(cell: RerunCell) -> Relearning:
-    """Return the job of a cell with the file of its curriculum in the cell's folder, where its process sees it."""
-    if cell.job.curriculum is None and cell.job.entry_point is None:
-        return cell.job
-    own = cell.folder.resolve() / CURRICULUM
-    write_whole(own, file_text(cell.curriculum.to_json()))
-    return cell.job._replace(curriculum=str(own))
+    job = cell.job
+    if job.curriculum is not None or job.entry_point is not None:  # a file in its folder, where its process sees it
+        file = cell.folder.resolve() / CURRICULUM
+        write_whole(file, file_text(cell.curriculum.to_json()))
+        job = job._replace(curriculum=str(file))
+    job.write(cell.folder / JOB)
+    found_in = [path.resolve() for path in code]
+    command = [sys.executable, "-P", "-s", "-m", MODULE, JOB, *map(str, found_in)]
+    variables = {"PYTHONPATH": str(home()), "PYTHONDONTWRITEBYTECODE": "1"}
+    if is_portable(cell.job.config):
+        variables |= VARIABLES
+    return run_isolated(command, cell.folder, limits, isolated, found_in, variables)
 
 
 def is_portable(config: ReadOnlyValues) -> bool:
@@ -394,19 +377,3 @@ def verified(submission: Submission, results: Mapping[SubmittedRun, Rerun], othe
     note = f"bits differ, as they may with {'; '.join(other_bits)}"
     values = [value for value in scored if value is not None]
     return [check_of_scores(submission, values, f"{name} of {len(scored)} reruns", RERUN, note), *without_bits]
-
-
-def _frames(run_dir: Path) -> int:
-    """Return the frames of the last whole line of a log that names them; 0 where there is none."""
-    path = run_dir / LOG
-    with suppress(OSError, ValueError):
-        with open_own(path, "rb") as file:
-            size = file.seek(0, os.SEEK_END)
-            file.seek(max(0, size - TAIL))
-            lines = file.read(TAIL).split(b"\n")[:-1]
-        for line in reversed(lines):
-            with suppress(ValueError, AttributeError):
-                frames = json_value(line, finite=False).get("frames")
-                if is_int(frames, 0):
-                    return frames
-    return 0

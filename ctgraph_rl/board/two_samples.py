@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
-from ctgraph_rl.checks import fraction, is_int, require
+from ctgraph_rl.checks import is_int, require
 
 ALPHA, POWER = 0.05, 0.8
 """The chance to find a difference where there is none, at most; and to find one of the size that is stated."""
@@ -22,7 +22,7 @@ SAMPLES = 4_000
 """Of normal scores, for the power."""
 
 ROUNDING = 1e-9
-"""Means that differ by less are equal."""
+"""Sums of scores that differ by less are equal."""
 
 
 class Difference(NamedTuple):
@@ -72,37 +72,20 @@ def compare_samples(submitted: Sequence[float], found: Sequence[float]) -> Diffe
     """
     sizes = (len(submitted), len(found))
     require((min(sizes) > 0, f"a comparison needs scores of both groups, got {sizes[0]} and {sizes[1]}"))
-    scores = np.array([[*submitted, *found]], dtype=np.float64)
-    squares = float(np.var(submitted)) * sizes[0] + float(np.var(found)) * sizes[1]
+    before = np.array(submitted, dtype=np.float64)
+    again = np.array(found, dtype=np.float64)
+    squares = float(before.var()) * sizes[0] + float(again.var()) * sizes[1]
     spread = math.sqrt(squares / max(1, sum(sizes) - 2))
+    reach = 2 * float(np.ptp([*submitted, *found])) + 1
     unit = detectable(*sizes)
     return Difference(
-        float(np.mean(submitted)),
-        float(np.mean(found)),
-        float(_p_values(scores, sizes[1])[0]),
-        low=_least_drop(scores, sizes[1]),
-        high=-_least_drop(-scores, sizes[1]),
+        float(before.mean()),
+        float(again.mean()),
+        float(_p_values(before, again)),
+        low=_first(lambda drop: _p_values(before, again + drop) > ALPHA, -reach, reach),
+        high=-_first(lambda drop: _p_values(-before, drop - again) > ALPHA, -reach, reach),
         detectable=unit if math.isinf(unit) else unit * spread,
     )
-
-
-def _least_drop(scores: np.ndarray, found: int) -> float:
-    """Return the smallest drop of the last scores, [1, submitted + found], that the test does not exclude."""
-    reach = 2 * float(np.ptp(scores)) + 1
-    low = -reach
-    high = reach
-
-    def is_excluded(drop: float) -> bool:
-        shifted = scores.copy()
-        shifted[:, -found:] += drop
-        return bool(_p_values(shifted, found)[0] <= ALPHA)
-
-    if not is_excluded(low):
-        return -math.inf
-    for _ in range(40):
-        middle = (low + high) / 2
-        low, high = (middle, high) if is_excluded(middle) else (low, middle)
-    return high
 
 
 def runs_needed(submitted: int) -> int:
@@ -112,57 +95,55 @@ def runs_needed(submitted: int) -> int:
 
 
 @cache
-def detectable(submitted: int, found: int, power: float = POWER) -> float:
-    """Return the drop, in standard deviations of normal scores, that the test finds with a given chance.
+def detectable(submitted: int, found: int) -> float:
+    """Return the drop, in standard deviations of normal scores, that the test finds with a chance of `POWER`.
 
     Args:
         submitted: number of submitted scores.
         found: number of the others.
-        power: the chance.
 
     Returns:
         The drop; infinite if the test can find none with so few scores.
     """
-    require(*fraction(power=power))
     if 1 / math.comb(submitted + found, found) > ALPHA:
         return math.inf
     noise = np.random.default_rng(0).standard_normal((SAMPLES, submitted + found))
-    low = 0.0
-    high = 1.0
-    while _share_found(noise, found, high) < power:
-        low = high
-        high = 2 * high
-    for _ in range(12):
-        middle = (low + high) / 2
-        low, high = (middle, high) if _share_found(noise, found, middle) < power else (low, middle)
-    return high
+    before = noise[:, :submitted]
+    again = noise[:, submitted:]
+    return _first(lambda drop: (_p_values(before, again - drop) <= ALPHA).mean() >= POWER, 0.0, 4.0, halvings=14)
 
 
-def _share_found(noise: np.ndarray, found: int, drop: float) -> float:
-    """Return the share of samples in which a drop of the last scores is found."""
-    scores = noise.copy()
-    scores[:, -found:] -= drop
-    return float((_p_values(scores, found) <= ALPHA).mean())
+def _p_values(submitted: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """Return the share of splits of scores [..., submitted] and [..., found] whose last group is as low, [...].
 
-
-def _p_values(scores: np.ndarray, found: int) -> np.ndarray:
-    """Return for each row of scores [n, submitted + found] the share of splits whose last group is as low, [n]."""
-    splits = _splits(scores.shape[1], found)
-    sums = scores @ splits.T
-    return (sums <= sums[:, :1] + ROUNDING).mean(axis=1)
+    scipy's ``permutation_test`` gives the same, but takes no group of one score.
+    """
+    splits = _splits(submitted.shape[-1] + found.shape[-1], found.shape[-1])
+    sums = np.concatenate([submitted, found], axis=-1) @ splits.T
+    return (sums <= sums[..., :1] + ROUNDING).mean(axis=-1)
 
 
 @cache
 def _splits(count: int, found: int) -> np.ndarray:
-    """Return who is in the second group, float64 [splits, count]: first the true one, then all or many random ones."""
+    """Return who is in the last group, float64 [splits, count]: first the true one, then all or many random ones."""
     if math.comb(count, found) <= MOST_SPLITS:
-        chosen = np.array(list(combinations(range(count), found)))
-        chosen = np.roll(chosen, 1, axis=0)  # the true one is the last
+        chosen = [*combinations(range(count), found)][::-1]  # the true one is the last
     else:
         rng = np.random.default_rng(0)
-        chosen = np.array(
-            [range(count - found, count), *(rng.permutation(count)[:found] for _ in range(MOST_SPLITS - 1))]
-        )
+        chosen = [range(count - found, count), *(rng.permutation(count)[:found] for _ in range(MOST_SPLITS - 1))]
     member = np.zeros((len(chosen), count))
-    np.put_along_axis(member, chosen, 1.0, axis=1)
+    np.put_along_axis(member, np.array(chosen), 1.0, axis=1)
     return member
+
+
+def _first(holds: Callable[[float], object], low: float, high: float, halvings: int = 40) -> float:
+    """Return where a rule begins to hold between two numbers; -inf if it holds at the first."""
+    if holds(low):
+        return -math.inf
+    for _ in range(halvings):
+        middle = (low + high) / 2
+        if holds(middle):
+            high = middle
+        else:
+            low = middle
+    return high

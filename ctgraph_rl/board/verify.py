@@ -13,7 +13,7 @@ import math
 import secrets
 import signal
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from functools import partial
@@ -24,14 +24,13 @@ from typing import NamedTuple
 
 from ctgraph_rl import parsers
 from ctgraph_rl.board.held_out import HELD_OUT, held_out_cells, held_out_checks
-from ctgraph_rl.board.isolate import Isolation, Limits, Outcome, isolation
+from ctgraph_rl.board.isolate import Isolation, Limits, isolation
 from ctgraph_rl.board.rerun import RERUN, RerunCell, cells_of, draw, learn_again, result_of, verified, why_other_bits
 from ctgraph_rl.board.rescore import RESCORED, Check, rescore
 from ctgraph_rl.board.submission import MOST_RUNS, VERIFICATION, Submission, read_submission
 from ctgraph_rl.board.two_samples import runs_needed
 from ctgraph_rl.checks import NamedValues, Rule, is_int, is_real, require
 from ctgraph_rl.disk import made_folder, write_whole
-from ctgraph_rl.learn.progress import ProgressBar
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
 from ctgraph_rl.log.files import locked
 from ctgraph_rl.log.provenance import machine, versions
@@ -61,119 +60,89 @@ NUMBERS = 2**63
 
 
 class Plan(NamedTuple):
-    """What a verification will run."""
+    """What a verification runs, and with what."""
 
     submission: Submission
     number: int
-    level: str
     reruns: list[RerunCell]
     held_out: list[RerunCell]
     other_bits: list[str]  # why bits are not promised on this machine
-    folder: Path
+    isolated: Isolation
+    arguments: argparse.Namespace  # limits and folders
 
     @property
     def cells(self) -> list[RerunCell]:
         """All processes, in order."""
         return [*self.reruns, *self.held_out]
 
-    @property
-    def num_frames(self) -> int:
-        """Frames of all processes."""
-        return sum(cell.num_frames for cell in self.cells)
 
-
-class Means(NamedTuple):
-    """With what a verification runs the code of others."""
-
-    isolation: Isolation
-    hours: float | None  # None: `LIMIT_TIMES` what the submitted runs took
-    memory: float  # GB
-    disk: float  # GB
-    paths: tuple[Path, ...]  # folders with code
-
-    def limits(self, cell: RerunCell) -> Limits:
-        """Return the limits of a process."""
-        usual = max(LEAST_SECONDS, math.ceil(min(LIMIT_TIMES * cell.seconds, MOST_HOURS * 3600)))
-        seconds = usual if self.hours is None else self.hours * 3600
-        return Limits(seconds, round(self.memory * GB), round(self.disk * GB))
-
-
-class Bar(ProgressBar):
-    """Shows run, frames, rate and time left of a verification."""
-
-    @property
-    def beginning(self) -> str:
-        """The text before the first frame."""
-        return "starting"
-
-    shown = 0
-    """Frames of the last update."""
-
-    def update(self, block: int, frames: int, episode_return: float) -> None:
-        """Show progress where there is some; see `ProgressBar.update`."""
-        if frames > max(self.done, self.shown):
-            self.shown = frames
-            super().update(block, frames, episode_return)
-
-    def describe(self, block: int, frames: int, episode_return: float, seconds: float) -> str:
-        """One line: number of the process, frames, rate and time left."""
-        text = super().describe(block, frames, episode_return, seconds)
-        return text.replace("block", "process", 1).replace("  return -", "")
-
-
-def planned(submission: Submission, level: str, number: int, count: int, folder: Path) -> Plan:
+def planned(submission: Submission, arguments: argparse.Namespace) -> Plan:
     """Return what a verification runs: as many runs as asked for, and enough for a test where one is needed.
 
-    Args:
-        submission: what is verified.
-        level: one of `LEVELS`, above the first.
-        number: of the verifier.
-        count: runs of each level.
-        folder: where processes have their folders.
-
     Raises:
-        ValueError: for runs that cannot be made again here.
+        ValueError: for runs that cannot be made again here, and where the code of others cannot be isolated.
     """
     other_bits = why_other_bits(submission, submission.runs)
     finished = len(submission.finished)
     require((finished > 0, f"{submission.path} has no finished run: there is nothing to run again"))
+    number = secrets.randbelow(10**9) if arguments.number is None else arguments.number
+    folder = made_folder(arguments.folder / f"{submission.digest[:12]}-{number}")
+    folder.chmod(0o700)  # others' code may make a program there that runs as you, for other users of this machine
+    count = arguments.cells
     enough = max(count, runs_needed(finished))
-    drawn = draw(submission, number, enough if other_bits else count)
-    reruns = cells_of(submission, drawn, folder / RERUN)
-    fresh = held_out_cells(submission, number, enough, folder / HELD_OUT) if level == HELD_OUT else []
-    return Plan(submission, number, level, reruns=reruns, held_out=fresh, other_bits=other_bits, folder=folder)
+    reruns = cells_of(submission, draw(submission, number, enough if other_bits else count), folder / RERUN)
+    fresh: list[RerunCell] = []
+    if arguments.level == HELD_OUT:
+        fresh = held_out_cells(submission, number, enough, folder / HELD_OUT)
+    limits = most_limits([*reruns, *fresh], arguments)
+    isolated = isolation(folder, limits, graphics=submission.config.get("device", "cpu") != "cpu")
+    why_not = isolated.why_not
+    require((why_not is None, f"the code of others is not run: {why_not}; --level {RESCORED} runs none"))
+    return Plan(submission, number, reruns, fresh, other_bits=other_bits, isolated=isolated, arguments=arguments)
 
 
-def describe_plan(plan: Plan, means: Means) -> list[str]:
+def limits_of(cell: RerunCell, arguments: argparse.Namespace) -> Limits:
+    """Return the limits of a process."""
+    seconds = max(LEAST_SECONDS, math.ceil(min(LIMIT_TIMES * cell.seconds, MOST_HOURS * 3600)))
+    if arguments.hours is not None:
+        seconds = arguments.hours * 3600
+    return Limits(seconds, round(arguments.memory * GB), round(arguments.disk * GB), cell.job.num_threads)
+
+
+def most_limits(cells: Sequence[RerunCell], arguments: argparse.Namespace) -> Limits:
+    """Return the limits of the longest process."""
+    return limits_of(max(cells, key=lambda cell: cell.seconds), arguments)
+
+
+def describe_plan(plan: Plan) -> list[str]:
     """Return lines about what will run, in which limits, and what is not isolated."""
     submission = plan.submission
+    arguments = plan.arguments
     cells = plan.cells
     seeds = f"{RERUN} of seeds {_seeds(plan.reruns)}"
     if plan.held_out:
         seeds += f"; {HELD_OUT} seeds {_seeds(plan.held_out)}"
     seconds = sum(cell.seconds for cell in cells)
-    limits = means.limits(max(cells, key=lambda cell: cell.seconds))
-    most = f"each at most {_time(limits.seconds)}, {means.memory:g} GB of memory and {means.disk:g} GB of disk"
+    frames = sum(cell.num_frames for cell in cells)
+    longest = _time(most_limits(cells, arguments).seconds)
+    most = f"each at most {longest}, {arguments.memory:g} GB of memory and {arguments.disk:g} GB of disk"
     count = f"{len(cells)} process{'es' * (len(cells) > 1)}"
+    found_in = "" if arguments.code is None else f", also looked for in {arguments.code}"
     lines = [
         f"number {plan.number} draws {seeds}",
-        f"{count}, {plan.num_frames:,} frames, {_time(seconds)} by the submitted times; {most}; in {plan.folder}",
-        f"code: {code_in_words(submission)}{', also looked for in ' * bool(means.paths)}{_joined(means.paths)}",
+        f"{count}, {frames:,} frames, {_time(seconds)} by the submitted times; {most}; in {cells[0].folder.parents[1]}",
+        f"code: {code_in_words(submission)}{found_in}",
     ]
     if plan.other_bits:
         lines.append(f"scores are tested where bits differ: {'; '.join(plan.other_bits)}")
-    lines.append(f"isolated: {'; '.join(means.isolation.closed())}")
-    for text in means.isolation.missing():
+    lines.append(f"isolated: {'; '.join(plan.isolated.closed())}")
+    for text in plan.isolated.missing():
         lines.append(f"NOT isolated: {text}")
     return list(map(terminal_text, lines))
 
 
 def _seeds(cells: Sequence[RerunCell]) -> str:
-    return ", ".join(_joined(cell.job.seeds) for cell in cells)
-
-
-def _joined(values: Iterable[object]) -> str:
-    return "+".join(map(str, values))
+    return ", ".join("+".join(map(str, cell.job.seeds)) for cell in cells)
 
 
 def _time(seconds: float) -> str:
@@ -225,31 +194,19 @@ def ask(lines: Sequence[str], yes: bool) -> None:
         sys.exit(1)
 
 
-def run_plan(plan: Plan, means: Means) -> dict[int, Outcome]:
-    """Run all processes of a plan in turn, with progress; return how each ended, by its place in ``cells``.
+def run_plan(plan: Plan) -> list[Check]:
+    """Run all processes of a plan in turn, and return the checks of what they leave.
 
     What an earlier verification of the same number has finished is not run again.
     """
-    cells = plan.cells
-    total = plan.num_frames
-    before = sum(cell.frames for cell in cells)
-    outcomes = {}
-    with Bar(len(cells), total, done=min(before, total)) as bar:
-        for place, cell in enumerate(cells):
-
-            def watch(number: int = place + 1) -> None:
-                bar.update(number, min(sum(each.frames for each in cells), total), math.nan)
-
-            outcomes[place] = learn_again(cell, means.limits(cell), means.isolation, means.paths, watch)
-            watch()
-    return outcomes
-
-
-def checks_of_plan(plan: Plan, outcomes: Mapping[int, Outcome]) -> list[Check]:
-    """Return the checks of all that a plan has run."""
+    arguments = plan.arguments
+    code = [] if arguments.code is None else [arguments.code]
     again = {}
     fresh = []
-    for cell, outcome in zip(plan.cells, outcomes.values(), strict=True):
+    cells = plan.cells
+    for place, cell in enumerate(cells, 1):
+        print(f"process {place}/{len(cells)}: seeds {_seeds([cell])}", file=sys.stderr, flush=True)
+        outcome = learn_again(cell, limits_of(cell, arguments), plan.isolated, code)
         for run in cell.runs:
             again[run] = result_of(cell, run.seed, outcome)
         if not cell.runs:
@@ -275,16 +232,13 @@ def level_of(checks: Sequence[Check]) -> str:
     return reached
 
 
-def write_verification(
-    submission: Submission, checks: Sequence[Check], plan: Plan | None = None, means: Means | None = None
-) -> Path:
+def write_verification(submission: Submission, checks: Sequence[Check], plan: Plan | None = None) -> Path:
     """Write ``verification.json`` into the folder of a submission; an earlier one is replaced.
 
     Args:
         submission: what was verified.
         checks: of all levels.
         plan: what was run; None if only files were checked.
-        means: with which limits and isolation.
     """
     drawn: list[str] = []
     seeds: list[int] = []
@@ -299,7 +253,7 @@ def write_verification(
         "number": None if plan is None else plan.number,
         "cells": drawn,
         "held_out_seeds": seeds,
-        "isolation": None if means is None else means.isolation._asdict(),
+        "isolation": None if plan is None else plan.isolated._asdict(),
         "checks": [],
         **machine(),
         "cpu": cpu_model(),
@@ -332,23 +286,12 @@ def verify(submission: Submission, arguments: argparse.Namespace) -> list[Check]
     if arguments.level == RESCORED or not all(check.passed for check in checks):
         write_verification(submission, checks)
         return checks
-    number = secrets.randbelow(10**9) if arguments.number is None else arguments.number
-    name = f"{submission.digest[:12]}-{number}"
-    folder = made_folder(arguments.folder / name)
-    folder.chmod(0o700)  # others' code may make a program there that runs as you, for other users of this machine
-    plan = planned(submission, arguments.level, number, arguments.cells, folder)
-    paths = () if arguments.code is None else (arguments.code,)
-    isolated = isolation(folder, graphics=submission.config.get("device", "cpu") != "cpu")
-    why_not = isolated.why_not
-    require((why_not is None, f"the code of others is not run: {why_not}; --level {RESCORED} runs none"))
-    means = Means(isolated, arguments.hours, memory=arguments.memory, disk=arguments.disk, paths=paths)
-    ask(describe_plan(plan, means), arguments.yes)
-    with (
-        locked(folder),
-        _ended_by_signals(f"interrupted, and no process is left; with --number {number} the same command resumes"),
-    ):
-        checks += checks_of_plan(plan, run_plan(plan, means))
-    write_verification(submission, checks, plan, means)
+    plan = planned(submission, arguments)
+    ask(describe_plan(plan), arguments.yes)
+    message = f"interrupted, and no process is left; with --number {plan.number} the same command resumes"
+    with locked(plan.cells[0].folder.parents[1]), _ended_by_signals(message):
+        checks += run_plan(plan)
+    write_verification(submission, checks, plan)
     return checks
 
 

@@ -12,7 +12,7 @@ import yaml
 from helpers.sweeping import command_line
 
 from ctgraph_rl.board import relearn, rerun, verify
-from ctgraph_rl.board.isolate import Isolation, Outcome
+from ctgraph_rl.board.isolate import CGROUP, Isolation, Outcome
 from ctgraph_rl.board.method_yaml import TEMPLATE
 from ctgraph_rl.board.relearn import Relearning
 from ctgraph_rl.board.submission import Submission, read_submission
@@ -95,7 +95,7 @@ def submission(tiny_submission: Submission, tmp_path: Path) -> Iterator[Submissi
     yield read_submission(folder, tiny_submission.track)
 
 
-CLOSED = Isolation(bubblewrap="0.8.0", why_not=None, graphics=False, is_root=False)
+CLOSED = Isolation(bubblewrap="0.8.0", why_not=None, memory=CGROUP, graphics=False)
 
 
 @pytest.fixture
@@ -103,15 +103,14 @@ def in_process(monkeypatch):
     """Reruns take place in this process; returns the folders in which they did."""
     folders = []
 
-    def run(module, arguments, folder, limits, **more):
+    def run(command, folder, limits, isolated, paths=(), variables=None):
         folders.append(folder)
         try:
-            relearn.learn_again(Relearning.read(folder / arguments[0]), folder)
+            relearn.learn_again(Relearning.read(folder / rerun.JOB), folder)
         except Exception as error:
-            return Outcome(1, None, 0.0, f"{type(error).__name__}: {error}")
-        more["watch"]()
-        return Outcome(0, None, 0.0, "")
+            return Outcome(1, None, f"{type(error).__name__}: {error}")
+        return Outcome(0, None, "")
 
     monkeypatch.setattr(rerun, "run_isolated", run)
-    monkeypatch.setattr(verify, "isolation", lambda folder, graphics: CLOSED)
+    monkeypatch.setattr(verify, "isolation", lambda folder, limits, graphics: CLOSED)
     return folders

@@ -15,7 +15,7 @@ import pytest
 from helpers.submissions import edit_run
 from helpers.sweeping import command_line
 
-from ctgraph_rl.board import bubblewrap, relearn, rerun, verify
+from ctgraph_rl.board import isolate, relearn, rerun, verify
 from ctgraph_rl.board.isolate import Isolation, Limits, Outcome
 from ctgraph_rl.board.relearn import Relearning, run_dir_of
 from ctgraph_rl.board.rerun import cells_of, draw, result_of
@@ -96,7 +96,7 @@ def test_an_honest_submission_is_rerun_and_a_second_call_repeats_no_run(
     assert "isolated: bubblewrap 0.8.0; no network" in said.out
     assert "NOT isolated: weaknesses of the kernel stay" in said.out
     assert written["isolation"]["bubblewrap"] == "0.8.0"
-    assert "process 2/2  512/512 frames" in said.err
+    assert "process 2/2: seeds " in said.err
     assert call(monkeypatch, tiny_home, folder, "--number=3", "--yes")[1]["level"] == "rerun"
     assert len(in_process) == 2
 
@@ -146,11 +146,11 @@ def test_nothing_runs_where_nobody_can_be_asked(tiny_submission, tiny_home, tmp_
     assert in_process == []
 
 
-def interrupted(plan, means):
+def interrupted(plan):
     raise KeyboardInterrupt
 
 
-def terminated(plan, means):
+def terminated(plan):
     signal.raise_signal(signal.SIGTERM)
 
 
@@ -174,8 +174,8 @@ def test_nothing_of_others_runs_without_bubblewrap_and_rescored_runs_nothing(
 ):
     folder = shutil.copytree(tiny_submission.path, tmp_path / "submission")
     why = "it needs bubblewrap 0.8 or newer, there is none: install the package bubblewrap"
-    opened = Isolation(bubblewrap=None, why_not=why, graphics=False, is_root=False)
-    monkeypatch.setattr(verify, "isolation", lambda folder, graphics: opened)
+    opened = Isolation(bubblewrap=None, why_not=why, memory=None, graphics=False)
+    monkeypatch.setattr(verify, "isolation", lambda folder, limits, graphics: opened)
 
     for level in ("rerun", "held_out"):
         code, _ = call(monkeypatch, tiny_home, folder, "--number=3", "--yes", f"--level={level}")
@@ -258,7 +258,7 @@ def test_a_learner_that_is_not_ours_is_called_by_its_entry_point(tiny_submission
         job = Relearning((3,), False, {}, 1, entry_point="waiting_learner:train", curriculum=path)
         relearn.learn_again(job, folder)
         cell = rerun.RerunCell(folder, job, (), tiny_submission.curriculum, 1.0)
-        result = result_of(cell, 3, Outcome(0, None, 0.0, ""))
+        result = result_of(cell, 3, Outcome(0, None, ""))
         assert (result.failure, result.agent_sha256) == (None, None)
         sums.append(rerun.log_sum(result.log))
 
@@ -273,11 +273,11 @@ def test_a_link_in_place_of_a_result_is_a_failure(tiny_home, tiny_submission, tm
     run_dir_of(cell.folder, 0).parent.mkdir(parents=True)
     run_dir_of(cell.folder, 0).symlink_to(tiny_home / "runs" / "tiny-seed0")
 
-    assert "symbolic link" in result_of(cell, 0, Outcome(0, None, 0.0, "")).failure
+    assert "symbolic link" in result_of(cell, 0, Outcome(0, None, "")).failure
 
 
 @pytest.mark.slow
-@pytest.mark.skipif((bubblewrap.version() or (0, 0)) < bubblewrap.OLDEST, reason="needs bubblewrap")
+@pytest.mark.skipif((isolate.bubblewrap_version() or (0, 0)) < isolate.OLDEST, reason="needs bubblewrap")
 def test_a_group_is_rerun_in_a_process_of_its_own(tiny_home, tiny_track, method, tmp_path, monkeypatch):
     settings = [f"agent.{name}" for name in ("num_envs=8", "num_steps=4", "hidden_size=4", "num_minibatches=1")]
     where = [f"--config-dir={tiny_home / 'conf'}", f"hydra.sweep.dir={tmp_path / 'runs'}"]
@@ -359,7 +359,7 @@ def test_a_failed_run_is_confirmed_by_its_own_failure_alone(tiny_submission, tmp
     if mark is not None:
         (run_dir_of(cell.folder, 0) / "failed.txt").write_text(mark)
 
-    result = result_of(cell, 0, Outcome(1, stopped, 0.0, "ModuleNotFoundError: No module named 'theirs'"))
+    result = result_of(cell, 0, Outcome(1, stopped, "ModuleNotFoundError: No module named 'theirs'"))
 
     assert (result.log, result.failed_alone) == (None, alone)
     assert result.failure
@@ -375,7 +375,7 @@ def test_logs_of_experts_are_compared_and_are_those_of_the_rerun(tiny_home, tiny
     def found(folder):
         experts = json.dumps({"kind": "experts", "experts": [{"task": 1, "run": folder}]})
         log_of.write_text("".join([*lines, experts + "\n"]))
-        return result_of(cell, 0, Outcome(0, None, 0.0, ""))
+        return result_of(cell, 0, Outcome(0, None, ""))
 
     other = RunLog.of_content("".join(lines[:-1]).encode(), log_of)
     result = found("experts/one")
@@ -415,10 +415,30 @@ def test_what_our_modules_import_is_the_code_of_others(tiny_submission):
 
 
 def test_limits_follow_from_what_the_submitted_run_took(tiny_submission, tmp_path):
-    means = verify.Means(None, None, memory=2.0, disk=1.0, paths=())
+    given = SimpleNamespace(hours=None, memory=2.0, disk=1.0)
     (cell,) = cells_of(tiny_submission, tiny_submission.runs[:1], tmp_path)
 
-    assert means.limits(cell) == Limits(600, 2 * 10**9, 10**9)
-    assert means.limits(cell._replace(seconds=1000.0)).seconds == 5000
-    assert means.limits(cell._replace(seconds=math.inf)).seconds == 10**5 * 3600
-    assert means._replace(hours=0.5).limits(cell).seconds == 1800
+    assert verify.limits_of(cell, given) == Limits(600, 2 * 10**9, 10**9, cell.job.num_threads)
+    assert verify.limits_of(cell._replace(seconds=1000.0), given).seconds == 5000
+    assert verify.limits_of(cell._replace(seconds=math.inf), given).seconds == 10**5 * 3600
+    given.hours = 0.5
+    assert verify.limits_of(cell, given).seconds == 1800
+
+
+@pytest.mark.skipif((isolate.bubblewrap_version() or (0, 0)) < isolate.OLDEST, reason="needs bubblewrap")
+def test_modules_of_others_are_found_after_those_that_are_installed(tiny_submission, tmp_path):
+    code = tmp_path / "code"
+    code.mkdir()
+    (code / "waiting_learner.py").write_text("def train(curriculum, seed, run_dir): print('its code ran', seed)")
+    for name in ("sitecustomize", "usercustomize", "types", "ctypes", "torch"):
+        (code / f"{name}.py").write_text("open('ran', 'w').close()")
+    method = {**tiny_submission.method, "entry_point": "waiting_learner:train"}
+    theirs = replace(tiny_submission, method=method)
+    (cell,) = cells_of(theirs, theirs.runs[:1], tmp_path / "reruns")
+    limits = Limits(120, 4 * 10**9, 10**9)
+    cell.folder.mkdir(parents=True)
+
+    outcome = rerun.learn_again(cell, limits, isolate.isolation(cell.folder, limits), [code])
+
+    assert (outcome.code, outcome.output) == (0, "its code ran 0\n")
+    assert not (cell.folder / "ran").exists()

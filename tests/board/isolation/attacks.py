@@ -2,23 +2,20 @@
 
 ``python attacks.py inside SPEC`` tries each attack that SPEC names, and prints a JSON object of what came of it:
 ``open`` where it worked, or the error. ``python attacks.py around SPEC`` starts the former in
-`ctgraph_rl.board.bubblewrap`, without the options that SPEC lists: a test then sees what each of them is for.
+`ctgraph_rl.board.isolate`, without the options that SPEC lists: a test then sees what each of them is for.
 """
 
 from __future__ import annotations
 
 import ctypes
-import fcntl
 import json
 import os
 import pty
 import socket
 import subprocess
 import sys
-import termios
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -51,18 +48,14 @@ def find(what: str, text: str) -> None:
     raise OSError(0, "none has it")
 
 
+def missing() -> None:
+    raise OSError(0, "it is not there")
+
+
 def connect(family: int, address: Any) -> None:
     with socket.socket(family) as client:
         client.settimeout(5)
         client.connect(address)
-
-
-def type_a_letter(spec: Any) -> None:
-    """Make a terminal, and put a letter into it."""
-    with suppress(OSError):
-        os.setsid()
-    _, terminal = os.openpty()
-    fcntl.ioctl(os.open(os.ttyname(terminal), os.O_RDWR), termios.TIOCSTI, b"x")
 
 
 def descriptors(spec: Any) -> None:
@@ -103,17 +96,17 @@ ATTACKS: dict[str, Callable[[Any], Any]] = {
     "file in /dev/shm": lambda spec: Path(spec["shm"]).read_bytes(),
     "other process": lambda spec: find("cmdline", "outside-marker"),
     "environment of others": lambda spec: find("environ", "MY_TOKEN"),
+    "environment": lambda spec: os.environ["MY_TOKEN"] if "MY_TOKEN" in os.environ else missing(),
     "network": lambda spec: connect(socket.AF_INET, ("127.0.0.1", spec["port"])),
     "socket": lambda spec: connect(socket.AF_UNIX, spec["socket"]),
     "abstract socket": lambda spec: connect(socket.AF_UNIX, "\0" + spec["abstract"]),
-    "other family of sockets": lambda spec: socket.socket(socket.AF_PACKET, socket.SOCK_RAW).close(),
+    "packets": lambda spec: socket.socket(socket.AF_PACKET, socket.SOCK_RAW).close(),
     "shared memory of others": shared_memory,
     "shared memory": lambda spec: called(LIBC.syscall(SHMGET, 0, 4096, 0o1600)),
     "memory file": lambda spec: os.close(os.memfd_create("hostile")),
     "keyring": lambda spec: called(LIBC.syscall(KEYCTL, 0, SESSION, 1)),
     "key": lambda spec: called(LIBC.syscall(ADD_KEY, b"user", b"hostile", b"x", 1, SESSION)),
     "user name space": lambda spec: called(LIBC.unshare(NEW_USER)),
-    "letter in a terminal": type_a_letter,
     "terminal": lambda spec: os.close(os.open("/dev/tty", os.O_RDWR)),
 }
 """Attacks by name, in the order in which they are tried: the first ones look at what is there."""
@@ -139,22 +132,22 @@ def inside(spec: Any) -> None:
 
 def around(spec: Any) -> None:
     """Start attacks in bubblewrap, from a process with a terminal and more that is open."""
-    from ctgraph_rl.board import bubblewrap
+    from ctgraph_rl.board import isolate
 
     extra = os.open(spec["socket"].rpartition("/")[0], os.O_RDONLY)
     os.set_inheritable(extra, True)
     folder = Path(spec["folder"])
-    for name in bubblewrap.OWN.values():
+    for name in isolate.OWN.values():
         (folder / name).mkdir(exist_ok=True)
-    with bubblewrap.program() as filtering:
+    with isolate.system_calls() as filtering:
         command = [sys.executable, "-I", "-S", f"{spec['code']}/attacks.py", "inside", json.dumps(spec)]
-        full = bubblewrap.confined(command, folder, [Path(spec["code"])], filtering=filtering)
+        full = isolate.confined(command, folder, [Path(spec["code"])], {}, filtering=filtering)
         for options, others in spec.get("without", ()):
             options = [str(filtering) if each == "FILTER" else each for each in options]
             starts = [i for i in range(len(full)) if full[i : i + len(options)] == options]
             full[starts[0] : starts[0] + len(options)] = others
         kept = () if not spec.get("descriptors") else (extra,)
-        done = subprocess.run(full, env={"PATH": "/usr/bin:/bin"}, capture_output=True, pass_fds=(filtering, *kept))
+        done = subprocess.run(full, capture_output=True, pass_fds=(filtering, *kept))
     sys.stdout.buffer.write(done.stdout + done.stderr)
 
 
