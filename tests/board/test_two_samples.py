@@ -20,19 +20,35 @@ def share_found(sizes: tuple[int, int], drop: float, draw) -> float:
 
 @pytest.mark.parametrize("sizes", [(5, 2), (10, 3)])
 def test_the_stated_drop_is_found_with_the_stated_chance(sizes, monkeypatch):
-    monkeypatch.setattr(two_samples, "_least_drop", lambda *_: 0.0)  # the interval takes the time
     rng = np.random.default_rng(7)
+    drop = detectable(*sizes)
+    monkeypatch.setattr(two_samples, "_first", lambda *_: 0.0)  # the interval takes the time
 
-    assert share_found(sizes, detectable(*sizes), rng.standard_normal) == pytest.approx(POWER, abs=0.05)
+    assert share_found(sizes, drop, rng.standard_normal) == pytest.approx(POWER, abs=0.05)
 
 
 @pytest.mark.parametrize("kind", ["normal", "two values"])
 def test_equal_distributions_are_called_different_as_seldom_as_stated(kind, monkeypatch):
-    monkeypatch.setattr(two_samples, "_least_drop", lambda *_: 0.0)
+    detectable(10, 3)
+    monkeypatch.setattr(two_samples, "_first", lambda *_: 0.0)
     rng = np.random.default_rng(7)
     draw = rng.standard_normal if kind == "normal" else lambda shape: rng.integers(0, 2, shape).astype(float)
 
     assert share_found((10, 3), 0.0, draw) <= ALPHA + 3 * math.sqrt(ALPHA * (1 - ALPHA) / 1_000)
+
+
+@pytest.mark.parametrize("sizes", [(5, 2), (10, 3), (3, 3)])
+def test_the_p_value_is_that_of_scipy(sizes):
+    stats = pytest.importorskip("scipy.stats")
+    rng = np.random.default_rng(7)
+    for scores in (rng.integers(0, 3, sum(sizes)) / 4, rng.random(sum(sizes)).round(1)):
+        submitted, found = scores[: sizes[0]], scores[sizes[0] :]
+
+        expected = stats.permutation_test(
+            (submitted, found), lambda _, last: last.sum().round(9), alternative="less", n_resamples=np.inf
+        )
+
+        assert compare_samples(submitted, found).p_value == pytest.approx(expected.pvalue, abs=1e-12)
 
 
 def test_a_test_that_can_find_nothing_says_so_and_how_many_runs_it_needs():
