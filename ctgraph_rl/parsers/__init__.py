@@ -223,7 +223,14 @@ def verify() -> ArgumentParser:
     _add(parser, "--number", drawn, type=int)
     _add(parser, "--code", "folder of modules that are not installed", metavar="DIR")
     _add(parser, "--hours", f"time limit of a process (default: {LIMIT_TIMES} times the submitted run's)", type=float)
-    _add(parser, "--memory", "memory limit of all its processes together (default: %(default)g)", default=8.0, metavar="GB", type=float)
+    _add(
+        parser,
+        "--memory",
+        "memory limit of all processes of a rerun (default: %(default)g)",
+        default=8.0,
+        metavar="GB",
+        type=float,
+    )
     _add(parser, "--disk", "disk limit of a process (default: %(default)g)", default=4.0, metavar="GB", type=float)
     parser.add_argument("--yes", action="store_true", help="skip the prompt despite incomplete isolation")
     _add(parser, "--folder", "folder of the reruns (default: %(default)s)", default=Path("verify"), metavar="DIR")
