@@ -201,6 +201,7 @@ def run_isolated(
     folder: Path,
     limits: Limits,
     isolated: Isolation,
+    *,
     paths: Sequence[Path] = (),
     variables: Mapping[str, str] | None = None,
 ) -> Outcome:

@@ -187,7 +187,7 @@ def learn_again(cell: RerunCell, limits: Limits, isolated: Isolation, code: Sequ
     variables = {"PYTHONPATH": str(home()), "PYTHONDONTWRITEBYTECODE": "1"}
     if is_portable(cell.job.config):
         variables |= VARIABLES
-    return run_isolated(command, cell.folder, limits, isolated, found_in, variables)
+    return run_isolated(command, cell.folder, limits, isolated, paths=found_in, variables=variables)
 
 
 def is_portable(config: ReadOnlyValues) -> bool:

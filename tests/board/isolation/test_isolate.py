@@ -128,7 +128,7 @@ def closed(tmp_path_factory: pytest.TempPathFactory) -> Isolation:
 
 def run(place: Path, isolated: Isolation, *arguments: str, limits: Limits = ROOMY, **more) -> Outcome:
     command = [sys.executable, str(place / "code" / "hostile.py"), *arguments]
-    return run_isolated(command, place / "work", limits, isolated, [place / "code"], **more)
+    return run_isolated(command, place / "work", limits, isolated, paths=[place / "code"], **more)
 
 
 def beats(place: Path) -> int:
@@ -208,7 +208,7 @@ def test_an_ordinary_user_without_a_cgroup_has_threads_with_a_share_of_the_memor
             "import sys; from pathlib import Path; from ctgraph_rl.board.isolate import *; place = Path(sys.argv[1]);"
             "limits = Limits(*map(int, sys.argv[3:])); here = isolation(place / 'work', limits); print(here);"
             "command = [sys.executable, str(place / 'code' / 'hostile.py'), sys.argv[2]];"
-            "print(run_isolated(command, place / 'work', limits, here, [place / 'code']).failure)"
+            "print(run_isolated(command, place / 'work', limits, here, paths=[place / 'code']).failure)"
         )
         command = [find_python(ordinary), "-c", code, folder, what, *map(str, limits)]
         environment = {"PYTHONPATH": package, "PATH": os.environ["PATH"]}
