@@ -9,6 +9,8 @@ from pathlib import Path
 
 from ctgraph_rl.checks import positive, require
 from ctgraph_rl.core.graph import CTGraph
+from ctgraph_rl.draw.curriculum_figure import draw_graphs
+from ctgraph_rl.draw.similarity_figure import draw_similarity
 from ctgraph_rl.log.escape import listed
 from ctgraph_rl.log.sheets import LISTED, Sheet
 from ctgraph_rl.log.sheets import print_sheet as print_sheet
@@ -23,8 +25,6 @@ from ctgraph_rl.tasks.observability import POLICIES, state_entropy, states_per_o
 from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
 from ctgraph_rl.tasks.task import Task, are_graphs, ct_graphs
 from ctgraph_rl.tasks.values import open_loop_ceiling, random_frames_to_goal
-from ctgraph_rl.visualize.curriculum_figure import draw_graphs
-from ctgraph_rl.visualize.similarity_figure import draw_similarity
 
 AGENT, FRAMES_PER_SECOND = "lstm_ppo", 18_000
 """An agent of this package and its rough speed on one core, for estimates of time."""

@@ -12,7 +12,6 @@ from torchrl.envs import EnvBase
 
 from ctgraph_rl.batch.assignment import checked_num_ids, one_hot_ids
 from ctgraph_rl.batch.native import Stepped
-from ctgraph_rl.batch.render import render
 from ctgraph_rl.batch.rows import Rows
 from ctgraph_rl.batch.specs import done_spec, reward_spec, specs_of
 from ctgraph_rl.checks import require, require_all, takes_numbers, true_or_false
@@ -21,6 +20,7 @@ from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import NO_LEAF, RowState, Shown
 from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.core.tree import Swap, is_done
+from ctgraph_rl.draw.pixels import render
 from ctgraph_rl.tasks.kinds.gym_task import GymTask
 from ctgraph_rl.tasks.kinds.registry import ENVIRONMENTS
 from ctgraph_rl.tasks.switch import Switch

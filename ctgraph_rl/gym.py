@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ctgraph_rl.batch.assignment import numbers_in
-from ctgraph_rl.batch.render import render
 from ctgraph_rl.batch.rows import Rows, seed_rule
 from ctgraph_rl.batch.shown_ids import with_id, with_task_ids
-from ctgraph_rl.batch.text_render import as_text
 from ctgraph_rl.checks import NamedValues, Rule, as_int, as_tuple, is_int, require, takes_numbers
 from ctgraph_rl.core.dynamics import NO_LEAF, OUTCOME_RUNNING, Shown, choose
+from ctgraph_rl.draw.pixels import render
+from ctgraph_rl.draw.text import as_text
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS, Json, make_task
 from ctgraph_rl.tasks.protocol import MOST_ROWS
 from ctgraph_rl.tasks.task import Task

@@ -20,13 +20,13 @@ from ctgraph_rl.describe import (
     to_latex,
     to_markdown,
 )
+from ctgraph_rl.draw.curriculum_figure import draw_graphs, goals_by_graph
 from ctgraph_rl.log import sheets
 from ctgraph_rl.log.sheets import Sheet
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
 from ctgraph_rl.tasks.switch import Drift
 from ctgraph_rl.tasks.task import are_graphs
-from ctgraph_rl.visualize.curriculum_figure import draw_graphs, goals_by_graph
 from curricula.__main__ import main
 
 A, B = surjective(goal=(1, 1)), surjective(goal=(1, 2))
@@ -307,7 +307,7 @@ def test_graphs_of_any_size_are_drawn(tmp_path, shapes):
 def boxes_of_labels(curriculum: Curriculum, monkeypatch: pytest.MonkeyPatch) -> list[list]:
     """Where the labels of each panel are, in pixels."""
     drawn = []
-    monkeypatch.setattr("ctgraph_rl.visualize.curriculum_figure.save_figure", lambda figure, _: drawn.append(figure))
+    monkeypatch.setattr("ctgraph_rl.draw.curriculum_figure.save_figure", lambda figure, _: drawn.append(figure))
     draw_graphs(curriculum, "unused.png")
     (figure,) = drawn
     figure.canvas.draw()

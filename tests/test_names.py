@@ -23,6 +23,8 @@ from rich.console import Console
 
 import curricula
 from ctgraph_rl import RunLog, describe
+from ctgraph_rl.draw.curriculum_figure import draw_graphs
+from ctgraph_rl.draw.dot import to_dot
 from ctgraph_rl.log import escape
 from ctgraph_rl.log.tables import write_tables
 from ctgraph_rl.report import formats, results
@@ -32,8 +34,6 @@ from ctgraph_rl.report.style import short
 from ctgraph_rl.report.terminal import print_summary
 from ctgraph_rl.runs.read import find_runs
 from ctgraph_rl.runs.status import FAILED, Status, report
-from ctgraph_rl.visualize.curriculum_figure import draw_graphs
-from ctgraph_rl.visualize.dot import to_dot
 
 PARTS = [
     *("\\input{/etc/passwd}", "\n\\write18{id}", "$x$", "%", "^^M", "&", "{", "}", "~", "#", '"', "\\\\", "* [2cm]"),

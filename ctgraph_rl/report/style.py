@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, require
+from ctgraph_rl.draw.style import import_matplotlib
 from ctgraph_rl.log.escape import figure_text, terminal_text
 from ctgraph_rl.packages import OF_REPORT
-from ctgraph_rl.visualize.style import import_matplotlib
 
 STYLE = Path(__file__).with_name("style.mplstyle")
 

@@ -13,10 +13,10 @@ from results_of import FOLDER
 from short_runs import NAME, draw_curves, lines_of
 
 import curricula
+from ctgraph_rl.draw import curriculum_figure
+from ctgraph_rl.draw.curriculum_figure import draw_graphs
+from ctgraph_rl.draw.similarity_figure import draw_similarity
 from ctgraph_rl.tasks.task import are_graphs
-from ctgraph_rl.visualize import curriculum_figure
-from ctgraph_rl.visualize.curriculum_figure import draw_graphs
-from ctgraph_rl.visualize.similarity_figure import draw_similarity
 
 DRAWINGS = {"graphs": draw_graphs, "similarity": draw_similarity, "curves": draw_curves}
 

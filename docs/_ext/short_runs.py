@@ -10,10 +10,10 @@ from results_of import PAGE, Line, raw
 from studies.raw import mean_of, numbers_in
 
 from ctgraph_rl import Curriculum
+from ctgraph_rl.draw.style import new_figure, save_figure
 from ctgraph_rl.report.bounds_of_runs import bounds_of_curriculum
 from ctgraph_rl.report.intervals import Bounds
 from ctgraph_rl.report.style import agent_style, frames_axis, style
-from ctgraph_rl.visualize.style import new_figure, save_figure
 
 NAME = "every_curriculum"
 

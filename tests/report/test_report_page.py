@@ -12,6 +12,7 @@ from helpers.made_runs import write_run
 
 import curricula
 from ctgraph_rl import RunLog
+from ctgraph_rl.play.visits import Visits
 from ctgraph_rl.report import __main__ as command
 from ctgraph_rl.report import page
 from ctgraph_rl.report.figures.gallery import Gallery
@@ -21,7 +22,6 @@ from ctgraph_rl.report.sections import evaluation_curve, over_seeds, sections, t
 from ctgraph_rl.run import run, show
 from ctgraph_rl.runs.load import Trained
 from ctgraph_rl.runs.read import find_runs
-from ctgraph_rl.visualize.visits import Visits
 
 for package in ("matplotlib", "jinja2", "scipy"):
     pytest.importorskip(package)

@@ -15,9 +15,9 @@ from helpers.sweeping import command_line
 from ctgraph_rl import CTGraph, CTGraphEnv, Observations, PaperImages, Task
 from ctgraph_rl.core import kernel
 from ctgraph_rl.core.device import checked_device
+from ctgraph_rl.draw import style
 from ctgraph_rl.report import intervals
 from ctgraph_rl.tasks.configurations import ct_fo_b1, ct_su_b1
-from ctgraph_rl.visualize import style
 
 TEXT = (CHECKOUT / "docs" / "how-to" / "troubleshooting.md").read_text(encoding="utf-8")
 QUOTED = re.findall(r"^\| `(.+?)` \|", TEXT, re.MULTILINE)

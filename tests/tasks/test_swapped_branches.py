@@ -10,6 +10,7 @@ from helpers.oracles import confounding, fully_observable, scripts, surjective, 
 
 from ctgraph_rl import CTGraphEnv, Gradient, Task
 from ctgraph_rl.core.graph import StateType
+from ctgraph_rl.draw.dot import to_dot
 from ctgraph_rl.learn.evaluate import evaluate
 from ctgraph_rl.policies import OptimalPolicy, SearchPolicy
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -17,7 +18,6 @@ from ctgraph_rl.tasks.observability import state_entropy
 from ctgraph_rl.tasks.protocol import Block
 from ctgraph_rl.tasks.similarity import graph_containment, observation_agreement, shared_decisions, state_agreement
 from ctgraph_rl.tasks.values import open_loop_ceiling, random_frames_to_goal
-from ctgraph_rl.visualize.dot import to_dot
 
 HOME, WAIT, DECISION, END, FAIL = StateType
 

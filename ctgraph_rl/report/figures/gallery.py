@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ctgraph_rl.disk import made_folder, write_whole
+from ctgraph_rl.draw.style import picture
 from ctgraph_rl.report.style import style
-from ctgraph_rl.visualize.style import picture
 
 FOLDER = "figures"
 INTERVAL = "the 95 % interval of the mean over seeds, within what is possible; one seed has none"

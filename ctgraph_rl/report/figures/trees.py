@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+from ctgraph_rl.draw.task_figure import draw_task
 from ctgraph_rl.log.files import AGENT, CURRICULUM
+from ctgraph_rl.play.visits import Visits, visits
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, left_out
 from ctgraph_rl.report.sections import Result, Section
 from ctgraph_rl.report.style import panels, short
@@ -13,8 +15,6 @@ from ctgraph_rl.runs.load import Trained, load
 from ctgraph_rl.runs.read import Run
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import are_graphs, ct_graphs
-from ctgraph_rl.visualize.task_figure import draw_task
-from ctgraph_rl.visualize.visits import Visits, visits
 
 MOST_TREES = 8
 COLUMNS = 2

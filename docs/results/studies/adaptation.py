@@ -324,7 +324,7 @@ def _() -> bool:
 
 def draw(path: Path) -> None:
     """Draw the success in each episode of a row, without gates: a panel for each graph, a line for each seed."""
-    from ctgraph_rl.visualize.style import new_figure, save_figure
+    from ctgraph_rl.draw.style import new_figure, save_figure
 
     graphs = [(1, FULL), (2, FULL), (3, FULL), (2, SURJECTIVE)]
     figure = new_figure(7.2, 3.0)

@@ -206,9 +206,9 @@ def page() -> str:
 
 def draw() -> None:
     """Draw the scores as bars with intervals."""
+    from ctgraph_rl.draw.style import save_figure
     from ctgraph_rl.profile.profile_page import draw_profiles
     from ctgraph_rl.report.style import style
-    from ctgraph_rl.visualize.style import save_figure
 
     with style():
         save_figure(draw_profiles({AGENTS[agent]: by_title for agent, by_title in scores().items()}), PICTURE)

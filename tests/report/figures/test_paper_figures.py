@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers.made_runs import all_runs, write_run
 
+from ctgraph_rl.draw.style import picture
 from ctgraph_rl.report import __main__ as command
 from ctgraph_rl.report import page
 from ctgraph_rl.report.figures.aggregates import (
@@ -23,7 +24,6 @@ from ctgraph_rl.report.figures.gallery import Gallery
 from ctgraph_rl.report.figures.learning_curves import draw_mean
 from ctgraph_rl.report.sections import sections
 from ctgraph_rl.report.style import style
-from ctgraph_rl.visualize.style import picture
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("scipy")

@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+from ctgraph_rl.draw.style import new_figure, save_figure
+from ctgraph_rl.draw.task_figure import draw_task
 from ctgraph_rl.report.figures.heatmaps import draw_performance
 from ctgraph_rl.report.statistics import Estimate, mean
 from ctgraph_rl.tasks.configurations import ct_su_b1
-from ctgraph_rl.visualize.style import new_figure, save_figure
-from ctgraph_rl.visualize.task_figure import draw_task
 from studies.raw import groups, read
 
 SIZE = 9.0, 4.2

@@ -116,7 +116,7 @@ def _learning_times(num_members: str) -> list[float]:
 
 def draw(path: Path) -> None:
     """Draw the frames to learn a block over the number of members, and the final returns block by block."""
-    from ctgraph_rl.visualize.style import new_figure, save_figure
+    from ctgraph_rl.draw.style import new_figure, save_figure
 
     figure = new_figure(7.2, 2.9)
     times, returns = figure.subplots(1, 2)

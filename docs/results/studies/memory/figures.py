@@ -17,7 +17,7 @@ DPI = 220
 
 def draw_returns(path: Path) -> None:
     """Draw the greedy return of every seed with first rewards given: a row of panels for each p."""
-    from ctgraph_rl.visualize.style import new_figure, save_figure
+    from ctgraph_rl.draw.style import new_figure, save_figure
 
     figure = new_figure(7.2, 7.4)
     panels = figure.subplots(3, 4, sharex=True, sharey=True)
@@ -69,7 +69,7 @@ def _panel(axes: Any, of: Mapping[str, Raw]) -> None:
 
 def draw_ladder(path: Path) -> None:
     """Draw how many seeds solve each rung of the ladder, a panel for each depth."""
-    from ctgraph_rl.visualize.style import new_figure, save_figure
+    from ctgraph_rl.draw.style import new_figure, save_figure
 
     of = ladder.finished()
     figure = new_figure(7.2, 0.9 + 0.24 * len(LADDER_CELLS))

@@ -18,7 +18,7 @@ NOT_LEARNED = 0.35
 
 def draw_strips(path: Path) -> None:
     """Draw the labels of all runs with detectors on four goals that come twice, and what they can do at the end."""
-    from ctgraph_rl.visualize.style import new_figure, save_figure
+    from ctgraph_rl.draw.style import new_figure, save_figure
 
     stay, of = 384_000, finished()[MASKS, "384000"]
     shown = [(name, line) for name, lines in of.items() if lines[0]["detector"] for line in lines]
@@ -101,7 +101,7 @@ def _strip(axes: Any, place: int, span: dict[str, str], colour: str) -> None:
 
 def draw_images(path: Path) -> None:
     """Draw the average performance of every seed on the image sets of each configuration."""
-    from ctgraph_rl.visualize.style import new_figure, save_figure
+    from ctgraph_rl.draw.style import new_figure, save_figure
 
     of = {name: finished().get((name, "204800"), {}) for name in IMAGES}
     names = [name for name in PLANNED[IMAGES[0], "204800"] if any(name in each for each in of.values())]

@@ -24,13 +24,12 @@ from ctgraph_rl import parsers
 from ctgraph_rl.checks import at_least_one, is_real, require
 from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL, OUTCOME_OTHER_END
 from ctgraph_rl.core.graph import StateType
+from ctgraph_rl.draw.layout import lay_out
 from ctgraph_rl.log.refuse import refused_by
+from ctgraph_rl.play.arguments import select
+from ctgraph_rl.play.player import Player
 from ctgraph_rl.tasks.images import white_level
 from ctgraph_rl.tasks.task import Task
-from ctgraph_rl.visualize.arguments import select
-from ctgraph_rl.visualize.layout import lay_out
-from ctgraph_rl.visualize.player import Player
-from ctgraph_rl.visualize.states import kind_of
 
 SHADES = " .:-=+*#%@"
 """From black to white, where there are no colours."""
@@ -141,15 +140,12 @@ def truth(task: Task, kind: StateType, place: int, goal_leaf: int) -> Tree:
     """
     graph = task.graph
     goal = graph.num_decision_states + goal_leaf
-    below = place
-    while below < graph.num_decision_states:
-        below = graph.branching_factor * below + 1
-    layout = lay_out(graph, [goal, below], MOST_BRANCHES)
+    layout = lay_out(graph, [goal, place], MOST_BRANCHES)
     root = Tree(Text("home" + (_here(kind) if kind == StateType.HOME else "")))
     drawn: dict[int, Tree] = {}
     for node in layout.x:
         label = f"{task.decision_to(node)}: " if node else ""
-        label += f"{kind_of(layout, node).name.lower()} state" + (", the goal" if node == goal else "")
+        label += f"{layout.kind(node).name.lower()} state" + (", the goal" if node == goal else "")
         at_node = node == place and kind != StateType.HOME
         above = drawn[graph.parent(node)] if node else root
         drawn[node] = above.add(Text(label + (_here(kind) if at_node else "")))

@@ -10,14 +10,14 @@ from typing import Any
 from ctgraph_rl import parsers
 from ctgraph_rl.checks import at_least_one, require
 from ctgraph_rl.disk import write_named
+from ctgraph_rl.draw.dot import to_dot
+from ctgraph_rl.draw.image_figure import image_figure
+from ctgraph_rl.draw.style import save_figure
+from ctgraph_rl.draw.task_figure import task_figure
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.refuse import refused_by
-from ctgraph_rl.visualize.arguments import Selection, select
-from ctgraph_rl.visualize.dot import to_dot
-from ctgraph_rl.visualize.gif import save_gif
-from ctgraph_rl.visualize.image_figure import image_figure
-from ctgraph_rl.visualize.style import save_figure
-from ctgraph_rl.visualize.task_figure import task_figure
+from ctgraph_rl.play.arguments import Selection, select
+from ctgraph_rl.play.gif import save_gif
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from ctgraph_rl.core.graph import WAIT_ACTION, StateType
+from ctgraph_rl.draw.layout import DECISION, END, FAIL, FAIL_KEY, HOME, HOME_KEY, WAIT, Key, lay_out, write_ids
+from ctgraph_rl.draw.style import colour
 from ctgraph_rl.log.escape import terminal_lines
 from ctgraph_rl.tasks.task import Task
-from ctgraph_rl.visualize import states as drawn
-from ctgraph_rl.visualize.layout import lay_out
-from ctgraph_rl.visualize.states import DECISION, END, FAIL, FAIL_KEY, HOME, HOME_KEY, WAIT, Key
-from ctgraph_rl.visualize.style import colour
 
 MOST_LEAVES = 1024
 """End states up to which a file has the whole tree."""
@@ -38,14 +36,14 @@ def _statements(task: Task, name: str) -> Iterator[str]:
     p = task.graph.wait_prob
     yield _attributes("graph", label=name, labelloc="t")
     yield _attributes("node", style="filled", fontname="sans-serif")
-    for state in (*drawn.states(layout), FAIL_KEY):
+    for state in (*layout.states(), FAIL_KEY):
         kind, node = state
         rings = {"peripheries": "2"} if state == (END, goal) else {}
-        text = drawn.ids_text(task, state, layout.level[node])
+        text = write_ids(task, state, layout.level[node])
         yield _attributes(_name(state), label=text, shape=SHAPES[kind], fillcolor=colour(kind), **rings)
-    for start, end, action in drawn.edges(task, layout):
+    for start, end, action in layout.edges(task):
         yield _attributes(f"{_name(start)} -> {_name(end)}", label="any" if start == HOME_KEY else str(action))
-    for state in drawn.states(layout):
+    for state in layout.states():
         if state[0] == WAIT and p > 0:
             yield _attributes(f"{_name(state)} -> {_name(state)}", label=f"{WAIT_ACTION} (p={p:g})")
         if state[0] in (WAIT, DECISION):

@@ -9,7 +9,10 @@ from typing import NamedTuple
 
 from ctgraph_rl import parsers
 from ctgraph_rl.checks import NamedValues, is_int, require
+from ctgraph_rl.draw.layout import in_digits
 from ctgraph_rl.learn.collect import InitialState, Policy
+from ctgraph_rl.play.player import Player
+from ctgraph_rl.play.visits import Visits, visits
 from ctgraph_rl.policies import NavigationPolicy, OptimalPolicy, RandomPolicy
 from ctgraph_rl.runs.config import curriculum_of
 from ctgraph_rl.runs.load import load
@@ -17,9 +20,6 @@ from ctgraph_rl.runs.settings import curriculum_names
 from ctgraph_rl.tasks.configurations import make_task
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import Task, ct_graphs
-from ctgraph_rl.visualize.layout import in_digits
-from ctgraph_rl.visualize.player import Player
-from ctgraph_rl.visualize.visits import Visits, visits
 
 POLICIES: dict[str, Policy] = dict(zip(parsers.POLICIES, (RandomPolicy, NavigationPolicy, OptimalPolicy), strict=True))
 

@@ -7,6 +7,7 @@ twice the size in palette numbers, and brought to size and to RGB by the mean of
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from itertools import pairwise
@@ -19,6 +20,7 @@ from torch import Tensor
 
 from ctgraph_rl.checks import is_int, require, takes_numbers
 from ctgraph_rl.core.graph import CTGraph, StateType
+from ctgraph_rl.draw.layout import DECISION, END, FAIL, FAIL_KEY, HOME, HOME_KEY, WAIT, Key, lay_out
 from ctgraph_rl.tasks.task import Task
 
 STATE_COLOURS: dict[StateType, tuple[int, int, int]] = {
@@ -43,9 +45,6 @@ OFF_GREY = 64  # around an observation, and where a one-hot vector is 0
 MIN_SIZE = 48
 SCALE = 2  # of a picture in pixels, and of its canvas relative to it
 LEAF_WIDTH = 6  # a tree with more than size // LEAF_WIDTH end states is drawn as a summary
-MAX_STUBS = 9  # most branches that a summary draws at one decision state
-HOME_KEY = -1
-FAIL_KEY = -2  # home and fail among the nodes; home is (node - 1) // b of the root
 
 
 class Mark(NamedTuple):
@@ -58,7 +57,6 @@ class Mark(NamedTuple):
 
 Pixels = NDArray[np.uint8]
 MarkLine = tuple[Mark, Mark]
-Places = dict[int, Mark]
 
 
 @takes_numbers
@@ -137,24 +135,20 @@ def _draw_row(task: Task, kind: int, node: int, goal_leaf: int, size: int) -> Pi
     """The right half of a row's picture in palette numbers."""
     graph = task.graph
     unit = size / 192
-    first_leaf = graph.num_decision_states
-    goal = first_leaf + goal_leaf
+    is_leaf = node >= graph.num_decision_states
+    goal = graph.num_decision_states + goal_leaf
     whole = graph.num_end_states <= size // LEAF_WIDTH
-    base, marks, waits = _picture(graph, size, () if whole else (node, goal))
+    base, marks = _picture(graph, size, () if whole else (node, goal))
     canvas = base.copy()
-    failed = kind == StateType.FAIL
-    if kind == StateType.HOME:
-        place = marks[HOME_KEY]
-    elif kind == StateType.WAIT or (failed and node >= first_leaf):
-        place = waits[node]
-    else:
-        place = marks[node]
-    way = [marks[key] for key in (HOME_KEY, *graph.nodes_to(node)[:-1])]
-    _lines(canvas, pairwise([*way, place]), 2 * unit, WAY)
-    _star(canvas, marks[goal], unit)
-    swapped = task.swapped_node
-    if swapped in marks:
-        _cross(canvas, marks[swapped], 0.6 * marks[swapped].radius, unit, OUTLINE)
+    failed = kind == FAIL
+    shown_kind = WAIT if is_leaf else DECISION
+    place = marks[shown_kind if failed else StateType(kind), node]
+    way = [marks[DECISION, passed] for passed in graph.nodes_to(node)[:-1]]
+    _lines(canvas, pairwise([marks[HOME_KEY], *way, place]), 2 * unit, WAY)
+    _star(canvas, marks[END, goal], unit)
+    swap = marks.get((DECISION, -1 if task.swapped_node is None else task.swapped_node))
+    if swap is not None:
+        _cross(canvas, swap, 0.6 * swap.radius, unit, OUTLINE)
     if failed:
         _cross(canvas, place, place.radius + 2.5 * unit, 2 * unit, kind)
     current = marks[FAIL_KEY] if failed else place
@@ -164,78 +158,35 @@ def _draw_row(task: Task, kind: int, node: int, goal_leaf: int, size: int) -> Pi
 
 
 @lru_cache(maxsize=128)
-def _picture(graph: CTGraph, size: int, nodes: tuple[int, ...]) -> tuple[Pixels, Places, Places]:
-    """The canvas of the whole tree or of the paths to two nodes, the places of all but wait states, and of those."""
+def _picture(graph: CTGraph, size: int, nodes: tuple[int, ...]) -> tuple[Pixels, dict[Key, Mark]]:
+    """The canvas of the whole tree or of the paths to two nodes, and the places of all states on it."""
     gap = 0.785 * size / (graph.depth + 1)
     home = Mark(size / 2, size / 14, min(size / 32, 0.5 * gap))
     fail = Mark(size * 0.925, size * 0.075, size / 25)
+    layout = lay_out(graph, nodes, size // LEAF_WIDTH)
+    widths = Counter(layout.level.values())
     marks = {HOME_KEY: home, FAIL_KEY: fail}
-    stubs = _place_paths(marks, graph, size, gap, nodes) if nodes else _place_all(marks, graph, size, gap)
-    first_leaf = graph.num_decision_states
-    decisions = [mark for node, mark in marks.items() if 0 <= node < first_leaf]
-    ends = [mark for node, mark in marks.items() if node >= first_leaf]
-    edges = {node: (marks[graph.parent(node)], mark) for node, mark in marks.items() if node >= 0}
-    waits = {node: _middle(*edge) for node, edge in edges.items()}
-    stub_ends = [end for _, end in stubs]
+    edges = []
+    for node, x in layout.x.items():
+        level = layout.level[node]
+        radius = min(size / 32, 0.3 * gap, 0.39 * size / widths[level])
+        mark = Mark(x * size, home.y + gap * (level + 1), radius)
+        above = marks[DECISION, graph.parent(node)] if node else home
+        marks[layout.kind(node), node] = mark
+        marks[WAIT, node] = _middle(above, mark)
+        edges.append((above, mark))
+    stubs = []
+    for node, x in layout.stubs:
+        start = marks[DECISION, node]
+        end = Mark(start.x + 0.75 * (x * size - start.x), start.y + 0.5 * gap, 0.6 * start.radius)
+        stubs.append((start, end))
     canvas = np.full((SCALE * size, SCALE * size), BACKGROUND, np.uint8)
-    _lines(canvas, [*edges.values(), *stubs], size / 192, EDGE)
-    _discs(canvas, [*waits.values(), *stub_ends], StateType.WAIT)
-    _discs(canvas, decisions, StateType.DECISION)
-    _discs(canvas, ends, StateType.END)
-    _discs(canvas, [home], StateType.HOME)
-    _discs(canvas, [fail], StateType.FAIL)
+    _lines(canvas, [*edges, *stubs], size / 192, EDGE)
+    _discs(canvas, [end for _, end in stubs], WAIT)
+    for kind in (WAIT, DECISION, END, HOME, FAIL):
+        _discs(canvas, [mark for (of_kind, _), mark in marks.items() if of_kind == kind], kind)
     _cross(canvas, fail, size / 60, size / 96, BACKGROUND)
-    return canvas, marks, waits
-
-
-def _place_all(marks: Places, graph: CTGraph, size: int, gap: float) -> list[MarkLine]:
-    """Add every node of a small tree, each level spread over the width. No branch is a stub."""
-    y = marks[HOME_KEY].y
-    for level in range(graph.depth + 1):
-        first = graph.first_node(level)
-        count = graph.branching_factor**level
-        width = size / count
-        radius = min(size / 32, 0.3 * gap, 0.39 * width)
-        for i in range(count):
-            marks[first + i] = Mark((i + 0.5) * width, y + gap * (level + 1), radius)
-    return []
-
-
-def _place_paths(marks: Places, graph: CTGraph, size: int, gap: float, nodes: tuple[int, ...]) -> list[MarkLine]:
-    """Add the paths to two nodes, one column that parts where they do. Returns stubs for the other branches."""
-    b = graph.branching_factor
-    home = marks[HOME_KEY]
-    radius = min(size / 32, 0.3 * gap)
-    fan = 1.6 * gap
-    paths = [graph.nodes_to(node) for node in nodes]
-    stubs = []
-    marks[0] = Mark(home.x, home.y + gap, radius)
-    for level in range(1, graph.depth + 1):
-        drawn = sorted({path[level] for path in paths if len(path) > level})
-        children: dict[int, Places] = {path[level - 1]: {} for path in paths if len(path) >= level}
-        for child, column in zip(drawn, (0.28 * size, 0.72 * size), strict=False):
-            parent = graph.parent(child)
-            start = marks[parent]
-            shift = column - start.x if len(drawn) > 1 else 0.0
-            marks[child] = Mark(start.x + min(max(shift, -fan), fan), start.y + gap, radius)
-            children[parent][graph.decision(child) - 1] = marks[child]
-        for parent, known in children.items():
-            stubs += _stubs(b, marks[parent], known, gap, min(fan, size / 3 / (b - 1)))
-    return stubs
-
-
-def _stubs(b: int, parent: Mark, children: Places, gap: float, fan: float) -> list[MarkLine]:
-    """Short lines towards the branches that are not drawn, in their order among those that are."""
-    known: list[float] = list(children) or [(b - 1) / 2]
-    places = [child.x for child in children.values()] or [parent.x]
-    stubs = []
-    for branch in range(0, b, math.ceil(b / MAX_STUBS)):
-        if branch not in children:
-            beyond = min(branch - known[0], 0) + max(branch - known[-1], 0)
-            x = float(np.interp(branch, known, places)) + beyond * fan
-            end = Mark(x, parent.y + gap, parent.radius)
-            stubs.append((parent, _middle(parent, end)))
-    return stubs
+    return canvas, marks
 
 
 def _middle(a: Mark, z: Mark) -> Mark:
@@ -285,7 +236,7 @@ def _fill(canvas: Pixels, centres: NDArray[np.float64], offsets: NDArray[np.int6
 
 
 def _discs(canvas: Pixels, marks: list[Mark], colour: int) -> None:
-    circles = np.array(marks)
+    circles = np.array(marks).reshape(-1, 3)
     for radius in np.unique(circles[:, 2]).tolist():
         _fill(canvas, circles[circles[:, 2] == radius, :2], _ring(-1, radius), colour)
 

@@ -14,10 +14,10 @@ from rich.console import Console
 
 from ctgraph_rl import cli
 from ctgraph_rl.core.graph import StateType
+from ctgraph_rl.play.game import SHADES, Game, has_colours, keyboard, main, picture, truth
+from ctgraph_rl.play.player import Player
 from ctgraph_rl.policies import OptimalPolicy
 from ctgraph_rl.tasks.configurations import ct_fo_b1, make_task
-from ctgraph_rl.visualize.play import SHADES, Game, has_colours, keyboard, main, picture, truth
-from ctgraph_rl.visualize.player import Player
 
 TO_GOAL_12 = "0 0 1 0 2 0"
 
@@ -114,7 +114,7 @@ def test_the_truth_of_a_large_tree_is_short():
 
     lines = lines_of(truth(task, StateType.DECISION, 5, 10**12 - 1))
 
-    assert len(lines) == 1 + 1 + 4 + 4 + 7  # home, root, two ways, what is left out
+    assert len(lines) == 1 + 1 + 1 + 4 + 5  # home, root, two ways, what is left out
     assert sum("the goal" in line for line in lines) == sum("you are here" in line for line in lines) == 1
     assert [line for line in lines if "998 more branches" in line] == lines[-1:]
 

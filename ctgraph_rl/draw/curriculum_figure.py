@@ -12,11 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from ctgraph_rl.core.graph import CTGraph, StateType
-from ctgraph_rl.log.escape import figure_text
-from ctgraph_rl.tasks.curriculum import Curriculum
-from ctgraph_rl.tasks.task import ct_graphs
-from ctgraph_rl.visualize.layout import MOST_PATHS, Layout, in_digits, lay_out
-from ctgraph_rl.visualize.style import (
+from ctgraph_rl.draw.layout import MOST_PATHS, Layout, in_digits, lay_out
+from ctgraph_rl.draw.style import (
     PlanePoint,
     draw_lines,
     goal_mark,
@@ -26,6 +23,9 @@ from ctgraph_rl.visualize.style import (
     shape_of,
     stub_lines,
 )
+from ctgraph_rl.log.escape import figure_text
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.task import ct_graphs
 
 MOST_PANELS = 12
 MOST_LEVEL = 4

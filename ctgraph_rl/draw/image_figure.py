@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ctgraph_rl.batch.rows import Rows
 from ctgraph_rl.core.graph import StateType
-from ctgraph_rl.env import CTGraphEnv
+from ctgraph_rl.draw.style import new_figure
 from ctgraph_rl.tasks.images import white_level
 from ctgraph_rl.tasks.task import Task
-from ctgraph_rl.visualize.style import new_figure
 
 MOST_IDS = 3
 """Ids of each kind of state that are shown with their variation."""
@@ -90,19 +90,19 @@ def _stored(task: Task, ids: list[int]) -> Tensor:
 
 
 def _reads(task: Task, shown: list[tuple[StateType, int]], count: int, seed: int) -> Tensor:
-    """Observations of ids by an environment whose states show no other, uint8 [ids, count, *shape]."""
+    """Observations of ids by rows whose states show no other, uint8 [ids, count, *shape]."""
     rows: list[Task] = []
     kinds: list[int] = []
     for kind, number in shown:
         rows += [_pinned(task, kind, number)] * count
         kinds += [kind] * count
-    env = CTGraphEnv(rows, seed)
-    env.reset()
-    state = env.rows.state
+    batch = Rows(rows, seed)
+    batch.reset()
+    state = batch.state
     state_type = state.state_type.new_tensor(kinds)
     node = torch.where(state_type == StateType.END, task.graph.num_decision_states, 0)
-    env.rows.state = state._replace(state_type=state_type, node=node)
-    return env.rows.show().observation.unflatten(0, (len(shown), count))
+    batch.state = state._replace(state_type=state_type, node=node)
+    return batch.show().observation.unflatten(0, (len(shown), count))
 
 
 def _pinned(task: Task, kind: StateType, number: int) -> Task:

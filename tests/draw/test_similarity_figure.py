@@ -6,10 +6,10 @@ import pytest
 from helpers.oracles import surjective
 
 import curricula
+from ctgraph_rl.draw import similarity_figure
+from ctgraph_rl.draw.similarity_figure import draw_similarity
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Block
-from ctgraph_rl.visualize import similarity_figure
-from ctgraph_rl.visualize.similarity_figure import draw_similarity
 
 GOALS = [(1, 1), (1, 2), (2, 2)]
 

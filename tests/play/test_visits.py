@@ -10,13 +10,13 @@ from tensordict import TensorDict
 from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.evaluate import evaluate
+from ctgraph_rl.play.gif import save_gif
+from ctgraph_rl.play.player import Player
+from ctgraph_rl.play.visits import visits
 from ctgraph_rl.policies import NavigationPolicy, OptimalPolicy, RandomPolicy
 from ctgraph_rl.tasks.configurations import ct_fo_b1, ct_fo_b2, ct_su_b1, make_task
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Block
-from ctgraph_rl.visualize.gif import save_gif
-from ctgraph_rl.visualize.player import Player
-from ctgraph_rl.visualize.visits import visits
 
 HOME, WAIT, DECISION, END, FAIL = StateType
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ctgraph_rl.checks import at_least_one, positive, require
 from ctgraph_rl.disk import write_named
-from ctgraph_rl.visualize.player import Player
+from ctgraph_rl.play.player import Player
 
 LAST = 3
 """Duration of the last picture, in durations of the others."""

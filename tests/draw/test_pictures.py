@@ -19,14 +19,14 @@ from matplotlib.figure import Figure
 import curricula
 from ctgraph_rl import cli
 from ctgraph_rl.core.graph import StateType
+from ctgraph_rl.draw.image_figure import image_figure
+from ctgraph_rl.draw.style import new_figure
+from ctgraph_rl.draw.task_figure import draw_task, task_figure
+from ctgraph_rl.play.pictures import main
+from ctgraph_rl.play.visits import visits
 from ctgraph_rl.policies import NavigationPolicy, RandomPolicy
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_fo_b2, ct_su_b1, make_task
 from ctgraph_rl.tasks.images import ImageFile
-from ctgraph_rl.visualize.draw import main
-from ctgraph_rl.visualize.image_figure import image_figure
-from ctgraph_rl.visualize.style import new_figure
-from ctgraph_rl.visualize.task_figure import draw_task, task_figure
-from ctgraph_rl.visualize.visits import visits
 
 HOME, WAIT, DECISION, END, FAIL = StateType
 

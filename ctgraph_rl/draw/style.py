@@ -12,12 +12,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ctgraph_rl.batch.render import GOAL, PALETTE
 from ctgraph_rl.checks import NamedValues
 from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.disk import write_named
+from ctgraph_rl.draw.layout import Layout
+from ctgraph_rl.draw.pixels import GOAL, PALETTE
 from ctgraph_rl.parsers import DPI
-from ctgraph_rl.visualize.layout import Layout
 
 MARKERS = {StateType.HOME: "p", StateType.WAIT: "o", StateType.DECISION: "D", StateType.END: "s", StateType.FAIL: "8"}
 """Pentagon, circle, diamond, square and octagon."""
@@ -78,7 +78,7 @@ def save_figure(figure: Any, path: Path | str, dpi: float = DPI) -> None:
 
 
 def colour(number: int) -> str:
-    """Return a colour of `ctgraph_rl.batch.render`'s palette, such as that of a kind of state, as ``#rrggbb``."""
+    """Return a colour of `ctgraph_rl.draw.pixels`'s palette, such as that of a kind of state, as ``#rrggbb``."""
     return "#" + "".join(f"{channel:02x}" for channel in PALETTE[number])
 
 
@@ -89,7 +89,7 @@ def mark(kind: StateType, size: float) -> NamedValues:
 
 
 def goal_mark(size: float) -> NamedValues:
-    """Return the style of a goal, the star of `ctgraph_rl.batch.render`."""
+    """Return the style of a goal, the star of `ctgraph_rl.draw.pixels`."""
     return _mark("*", size, colour(GOAL), edge_width=0.8)
 
 
@@ -113,10 +113,12 @@ def draw_lines(axes: Any, lines: Sequence[Sequence[PlanePoint]], **style: Any) -
 
 
 def stub_lines(layout: Layout, places: Mapping[int, PlanePoint], height: float) -> list[list[PlanePoint]]:
-    """Return short lines from the states drawn towards branches left out, left or right of those drawn."""
-    reach = 1 / max(len(layout.leaves), 3) / 7
-    ends = [(places[node], side) for node, side in layout.stubs]
-    return [[(x, y), (x + side * reach, y - height)] for (x, y), side in ends]
+    """Return short lines from the states drawn half the way towards branches left out."""
+    lines = []
+    for node, end in layout.stubs:
+        x, y = places[node]
+        lines.append([(x, y), ((x + end) / 2, y - height)])
+    return lines
 
 
 def shape_of(graph: CTGraph) -> str:

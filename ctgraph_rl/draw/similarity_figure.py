@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from ctgraph_rl.draw.style import new_figure, save_figure
 from ctgraph_rl.log.escape import figure_text
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.similarity import MEASURES
 from ctgraph_rl.tasks.task import ct_graphs
-from ctgraph_rl.visualize.style import new_figure, save_figure
 
 MOST_NUMBERS, MOST_LABELS = 8, 40
 """Tasks up to which a heat map shows numbers and labels."""

@@ -11,13 +11,13 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from ctgraph_rl.core.graph import StateType
+from ctgraph_rl.draw.layout import Key
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.collect import InitialState, Policy
 from ctgraph_rl.learn.evaluate import evaluate
 from ctgraph_rl.policies import RandomPolicy
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import Task
-from ctgraph_rl.visualize.states import Key
 
 
 class Visits(NamedTuple):

@@ -7,11 +7,24 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ctgraph_rl.core.graph import WAIT_ACTION, StateType
+from ctgraph_rl.draw.layout import (
+    DECISION,
+    END,
+    FAIL,
+    FAIL_KEY,
+    HOME,
+    HOME_KEY,
+    MOST_LEAVES,
+    MOST_PATHS,
+    WAIT,
+    Edge,
+    Key,
+    in_digits,
+    lay_out,
+    write_ids,
+)
+from ctgraph_rl.draw.style import PlanePoint, colour, draw_lines, goal_mark, mark, new_figure, shape_of, stub_lines
 from ctgraph_rl.tasks.task import Task
-from ctgraph_rl.visualize import states as drawn
-from ctgraph_rl.visualize.layout import MOST_LEAVES, MOST_PATHS, in_digits, lay_out
-from ctgraph_rl.visualize.states import DECISION, END, FAIL, FAIL_KEY, HOME, HOME_KEY, WAIT, Edge, Key
-from ctgraph_rl.visualize.style import PlanePoint, colour, draw_lines, goal_mark, mark, new_figure, shape_of, stub_lines
 
 Counted = Mapping[Any, float]
 PerAction = Mapping[Any, Any]
@@ -63,7 +76,7 @@ def draw_task(
         axes: matplotlib axes, of their size when the picture is made.
         task: any task.
         visits: how often each state was visited: the numbers stand in the nodes instead of ids, and edges are as wide
-            as they were used. `ctgraph_rl.visualize.visits.visits` counts.
+            as they were used. `ctgraph_rl.play.visits.visits` counts.
         policy: b + 1 action probabilities for each state, or the number of its greedy action: edges have the numbers,
             and the likeliest action is black.
         values: b + 1 numbers for each state, such as Q-values, which stand at the edges.
@@ -92,7 +105,7 @@ class _TaskPicture:
         most_visited = sorted(counts, key=lambda node: -counts[node])[: MOST_PATHS - 1]
         self.layout = lay_out(self.graph, [self.goal, *most_visited])
         self.waits = self.layout.is_whole or self.graph.depth <= MOST_WAIT_LEVELS
-        self.places = {state: self._place(state) for state in drawn.states(self.layout, self.waits)}
+        self.places = {state: self._place(state) for state in self.layout.states(self.waits)}
         self.size, beside = self._sizes()
         self.has_room = beside >= ROOM
         self.has_numbers = beside >= ROOM_FOR_NUMBERS
@@ -139,7 +152,7 @@ class _TaskPicture:
             self._draw_legend()
 
     def _draw_edges(self) -> None:
-        found = sorted(drawn.edges(self.task, self.layout, self.waits), key=self._is_strong)
+        found = sorted(self.layout.edges(self.task, self.waits), key=self._is_strong)
         lines = []
         colours = []
         widths = []
@@ -215,7 +228,7 @@ class _TaskPicture:
         """Return the text within a node."""
         if self.visits:
             return _short(self.visits.get(state, 0))
-        return drawn.ids_text(self.task, state, self.layout.level[state[1]]) if self.ids else INITIALS[state[0]]
+        return write_ids(self.task, state, self.layout.level[state[1]]) if self.ids else INITIALS[state[0]]
 
     def _draw_goal(self) -> None:
         """A star below the goal, and the decisions below every end state of a tree that is not drawn whole."""

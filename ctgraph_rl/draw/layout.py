@@ -1,0 +1,181 @@
+"""The layout of a tree and the states in it, for all pictures: leaves side by side, other nodes in the middle above.
+
+A small tree is laid out whole, a larger one as the paths to some of its nodes. Nodes are heap indices: branch a of
+node n is b * n + a, and the root is 0. Time and memory grow with the nodes laid out, not with the tree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from ctgraph_rl.core.graph import WAIT_ACTION, CTGraph, StateType
+from ctgraph_rl.tasks.task import Task
+
+HOME, WAIT, DECISION, END, FAIL = StateType
+
+Key = tuple[StateType, int]
+"""A state: its type and its node, the heap index that ``env.node`` gives. Home and fail have node 0."""
+
+HOME_KEY = (HOME, 0)
+FAIL_KEY = (FAIL, 0)
+
+MOST_LEAVES = 32
+"""End states up to which a tree is drawn whole."""
+MOST_PATHS = 8
+"""End states that are drawn of a larger tree."""
+MOST_STUBS = 3
+"""Branches left out that are hinted at on each side of those drawn."""
+MOST_DIGITS = 14
+"""Characters up to which the decisions of a path are written out."""
+
+
+class Edge(NamedTuple):
+    """A transition that an action makes, waiting in place and failing aside."""
+
+    start: Key
+    end: Key
+    action: int | None
+    """None at home, which any action leaves."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The nodes of a tree that are drawn, and their places.
+
+    Args:
+        graph: the tree.
+        x: the place of every node drawn, in (0, 1); from top to bottom, and from left to right within a level.
+        level: the number of decisions taken at every node drawn.
+    """
+
+    graph: CTGraph
+    x: dict[int, float]
+    level: dict[int, int]
+
+    @property
+    def leaves(self) -> list[int]:
+        """The end states drawn."""
+        return [node for node, level in self.level.items() if level == self.graph.depth]
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether every end state is drawn."""
+        return len(self.leaves) == self.graph.num_end_states
+
+    @property
+    def stubs(self) -> list[tuple[int, float]]:
+        """Hints at branches left out: a node, and the x of a branch left or right of those drawn."""
+        b = self.graph.branching_factor
+        reach = 2 / max(len(self.leaves), 3) / 7
+        hints = []
+        for node, branches in self._branches().items():
+            if branches:
+                first = self.x[b * node + branches[0]]
+                last = self.x[b * node + branches[-1]]
+                hints += [(node, first - reach * k) for k in range(1, min(branches[0] - 1, MOST_STUBS) + 1)]
+                hints += [(node, last + reach * k) for k in range(1, min(b - branches[-1], MOST_STUBS) + 1)]
+            else:
+                count = min(b, 2 * MOST_STUBS)
+                hints += [(node, self.x[node] + reach * (k - (count - 1) / 2)) for k in range(count)]
+        return hints
+
+    @property
+    def left_out(self) -> dict[int, int]:
+        """The number of branches left out at each node where some are."""
+        b = self.graph.branching_factor
+        return {node: b - len(drawn) for node, drawn in self._branches().items() if len(drawn) < b}
+
+    def _branches(self) -> dict[int, list[int]]:
+        """The decisions drawn at each decision state, ascending, in 1..b."""
+        branches: dict[int, list[int]] = {node: [] for node, level in self.level.items() if level < self.graph.depth}
+        for node in self.x:
+            if node:
+                branches[self.graph.parent(node)].append(self.graph.decision(node))
+        return branches
+
+    def kind(self, node: int) -> StateType:
+        """Return whether a node is a decision or an end state."""
+        return END if self.level[node] == self.graph.depth else DECISION
+
+    def states(self, waits: bool = True) -> Iterator[Key]:
+        """Yield all states drawn but fail, from top to bottom; wait states among them or not."""
+        yield HOME_KEY
+        for node in self.x:
+            if waits:
+                yield WAIT, node
+            yield self.kind(node), node
+
+    def edges(self, task: Task, waits: bool = True) -> Iterator[Edge]:
+        """Yield all transitions of a task between states; without wait states, to what these lead to."""
+        for node in self.x:
+            here = self.kind(node), node
+            above = (DECISION, self.graph.parent(node)) if node else HOME_KEY
+            action = task.decision_to(node) if node else None
+            yield Edge(above, (WAIT, node) if waits else here, action)
+            if waits:
+                yield Edge((WAIT, node), here, WAIT_ACTION)
+
+
+def lay_out(graph: CTGraph, ends: Iterable[int], most_leaves: int = MOST_LEAVES) -> Layout:
+    """Place the whole tree, or the paths to some of its nodes where it has more end states than ``most_leaves``.
+
+    Args:
+        graph: the tree.
+        ends: nodes, at least one.
+        most_leaves: end states up to which all are drawn.
+    """
+    first = graph.num_decision_states
+    count = graph.num_end_states
+    if count <= most_leaves:
+        tips = dict.fromkeys(range(first, first + count), graph.depth)
+    else:
+        paths = [graph.nodes_to(end) for end in set(ends)]
+        inner = {node for path in paths for node in path[:-1]}
+        last = [path for path in paths if path[-1] not in inner]
+        tips = {path[-1]: len(path) - 1 for path in sorted(last, key=lambda path: graph.path(path[-1]))}
+    x = {node: (i + 0.5) / len(tips) for i, node in enumerate(tips)}
+    rows: list[list[int]] = []
+    below: list[int] = []
+    for depth in reversed(range(graph.depth + 1)):
+        children: dict[int, list[float]] = {}
+        for node in below:
+            children.setdefault(graph.parent(node), []).append(x[node])
+        for node, places in children.items():
+            x[node] = (places[0] + places[-1]) / 2
+        below = sorted([*children, *(node for node, level in tips.items() if level == depth)])
+        rows.append(below)
+    level = {node: depth for depth, row in enumerate(reversed(rows)) for node in row}
+    return Layout(graph, {node: x[node] for node in level}, level)
+
+
+def shown_ids(task: Task, state: Key, level: int) -> tuple[int, int]:
+    """Return the first and the last id that a state may show.
+
+    Args:
+        task: any task.
+        state: a state of its graph.
+        level: the decisions taken before it.
+    """
+    kind, node = state
+    x = task.observations
+    graph = task.graph
+    first, last = x.ids(kind)
+    if not x.is_unique(kind):
+        return first, last
+    within_level = node - graph.first_node(level)
+    number = first + (x.first_of_level(graph, kind, level) + within_level) % (last - first + 1)
+    return number, number
+
+
+def write_ids(task: Task, state: Key, level: int) -> str:
+    """Return an id, or the first and the last one with a dash; arguments as `shown_ids`."""
+    first, last = shown_ids(task, state, level)
+    return str(first) if first == last else f"{first}-{last}"
+
+
+def in_digits(decisions: Sequence[int], sign: str = "") -> str:
+    """Write decisions in short, as ``121``, or with a sign between them; a dot where one has two digits."""
+    text = (sign if max(decisions) < 10 else ".").join(map(str, decisions))
+    return text if len(text) <= MOST_DIGITS else f"{text[: MOST_DIGITS // 2]}...{text[-MOST_DIGITS // 2 :]}"
