@@ -1,8 +1,7 @@
-"""Where `curricula`, `baselines` and the yaml files in ``conf`` are, and how modules are imported by name."""
+"""Where `curricula`, `baselines` and the yaml files in ``conf`` are, and how what a name stands for is imported."""
 
 from __future__ import annotations
 
-import gc
 import os
 import sys
 import warnings
@@ -10,37 +9,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
+from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
 from ctgraph_rl.checks import require
 
 HERE = Path(__file__).resolve().parent
 
-FULL_COLLECTIONS = 100
-"""Collections of the middle generation between two full ones; Python's default is 10."""
-
 OF_REPORT = ("matplotlib", "jinja2", "scipy")
 """Packages that the extra ``report`` installs."""
-
-
-@contextmanager
-def first_imports() -> Iterator[None]:
-    """Pause garbage collection while torch is imported for the first time, and leave its objects out of later ones.
-
-    A full collection visits the 300,000 objects of torch, none of which is garbage, and there are several in an import.
-    Later full collections are ten times as rare: what `torch.compile` makes takes 0.3 s to visit and lasts, too.
-    """
-    pauses = gc.isenabled() and "torch" not in sys.modules
-    if pauses:
-        gc.disable()
-    try:
-        yield
-    finally:
-        if pauses:
-            gc.freeze()
-            young, middle, _ = gc.get_threshold()
-            gc.set_threshold(young, middle, FULL_COLLECTIONS)
-            gc.enable()
 
 
 def makes_page(command: str) -> str:
@@ -99,9 +77,15 @@ def import_agents(config_dir: Path) -> list[str]:
     return problems
 
 
+def load_object(name: str) -> Any:
+    """Return what a name such as ``module:Class`` stands for, in a module of anyone."""
+    module, _, own_name = name.partition(":")
+    return attrgetter(own_name)(import_module(module))
+
+
 @contextmanager
 def importing_from_here() -> Iterator[None]:
-    """Find modules in the working directory, too, where a user's own function may be, as a run does."""
+    """Find modules in the working directory, too, as a run does."""
     before = list(sys.path)
     sys.path.append(os.getcwd())
     try:

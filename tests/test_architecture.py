@@ -20,11 +20,11 @@ from ctgraph_rl.core import rewards
 
 FLOORS = (
     ("ctgraph_rl", "checks", "metrics", "parsers"),
-    ("disk",),
+    ("disk", "packages"),
     ("strict",),
     ("core", "portable"),
     ("tasks",),
-    ("packages", "batch", "agent", "curricula"),
+    ("batch", "agent", "curricula"),
     ("log",),
     ("draw",),
     ("env", "gym"),
@@ -34,7 +34,8 @@ FLOORS = (
     ("play", "hydra_plugins"),
     ("report",),
     ("collective", "board", "profile"),
-    ("cli", "run", "describe", "compare", "testing"),
+    ("cli", "describe", "compare", "testing"),
+    ("run",),
     ("benchmarks",),
 )
 """Wings, lower ones first: each imports what is below, and itself; those of one floor do not import each other."""
@@ -71,7 +72,7 @@ DOORS = {
     "ctgraph_rl": "its names are imported when they are first used",
     "ctgraph_rl.cli": "the module of a command",
     "ctgraph_rl.log.named_curricula": "the curricula that are published",
-    "ctgraph_rl.packages": "classes of agents and methods by the names that runs stored",
+    "ctgraph_rl.packages": "classes by the names that runs stored, and wrappers of others",
     "ctgraph_rl.profile.properties": "a table that learns a model of an agent's data",
     "ctgraph_rl.profile.scoring": "the properties of the profile's curricula",
     "ctgraph_rl.runs.seeds": "the batches of seeds, which know the agents",
@@ -80,7 +81,6 @@ DOORS = {
     "ctgraph_rl.metrics": "all of its own modules, so that no metric is left out",
     "ctgraph_rl.report.style": "packages of an extra",
     "ctgraph_rl.runs.trackers": "packages of an extra",
-    "ctgraph_rl.tasks.kinds.gym_task": "wrappers of others",
     "curricula": "its names are imported when they are first used",
 }
 """Modules that import by name, and why."""

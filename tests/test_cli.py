@@ -15,8 +15,8 @@ import pytest
 
 import curricula
 from ctgraph_rl import cli, packages
+from ctgraph_rl.cli import first_imports
 from ctgraph_rl.describe import FRAMES_PER_SECOND, listing, to_markdown
-from ctgraph_rl.packages import first_imports
 from ctgraph_rl.tasks.curriculum import Curriculum
 from curricula.__main__ import main as curricula_main
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
-from importlib import import_module
-from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from ctgraph_rl.checks import as_tuple, is_int, is_real, make_fields_plain, require, true_or_false
+from ctgraph_rl.packages import load_object
 from ctgraph_rl.tasks.kinds.frozen_arguments import by_name, thaw
 from ctgraph_rl.tasks.kinds.gym_spaces import ActionForm, ObservationForm
 from ctgraph_rl.tasks.kinds.registry import environment
@@ -328,8 +327,6 @@ def _wrapped(env: Any, wrapper: Any) -> Any:
     from gymnasium import Env
 
     name, arguments = (wrapper, ()) if isinstance(wrapper, str) else wrapper
-    module, _, own_name = name.partition(":")
-    wrap = attrgetter(own_name)(import_module(module))
-    found = wrap(env, **{key: thaw(value) for key, value in arguments})
+    found = load_object(name)(env, **{key: thaw(value) for key, value in arguments})
     require((isinstance(found, Env), f"the wrapper {name} must return a gymnasium.Env, got {found!r:.80}"))
     return found
