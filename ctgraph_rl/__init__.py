@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from ctgraph_rl.learn.lifelong import learn_curriculum as learn_curriculum
     from ctgraph_rl.log.run_log import RunLog as RunLog
     from ctgraph_rl.log.scores import scores as scores
+    from ctgraph_rl.report.frame import results as results
     from ctgraph_rl.runs.job import make_agent as make_agent
     from ctgraph_rl.runs.load import Trained as Trained
     from ctgraph_rl.runs.load import load as load
@@ -63,6 +64,7 @@ _EXPORTS = {
     "learn.lifelong": ("learn_curriculum",),
     "log.run_log": ("RunLog",),
     "log.scores": ("scores",),
+    "report.frame": ("results",),
     "runs.job": ("make_agent",),
     "runs.load": ("Trained", "load"),
     "runs.recorder": ("Recorder",),

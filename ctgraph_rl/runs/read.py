@@ -10,8 +10,9 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -46,6 +47,13 @@ NO_METHOD = "Finetune"
 FOLDER = "folder"
 """Setting of a run that names no agent: all of these in one folder are one learner."""
 
+MEASURES = {
+    "evaluation": ("", ("return_mean", "success_rate")),
+    "adaptation": ("adaptation_", ("return_mean", "success_rate", "found_rate", "exact_rate")),
+    "training": ("training_", ("return_mean", "success_rate")),
+}
+"""For each kind of measurement, how its values' names begin, and the fields that are values."""
+
 MOST_MODULES = 3
 """Modules that differ between runs that else are alike and are named; one digest stands for all others."""
 
@@ -57,6 +65,23 @@ AgentKey = tuple[str, str]
 
 Curve = list[tuple[int, float]]
 """Mean returns after numbers of frames; NaN for one without a value."""
+
+
+class Value(NamedTuple):
+    """A number that a run measured; a field that says nothing about it is None."""
+
+    task: str | None  # label of an evaluated task
+    held_out: bool | None  # whether no block trains the task
+    block: int | None  # in or after which it was measured; 0 before any training
+    moment: str | None  # of an evaluation: before any training, during a block or after it
+    frames: int | None  # learned so far
+    episode: int | None  # of a row that adapts, from 1
+    metric: str
+    value: float | None
+
+
+NOWHERE = (None,) * 6
+"""Where a number of the whole run was measured."""
 
 
 class History(NamedTuple):
@@ -94,10 +119,8 @@ class Run:
             the directory is in with them if there is no agent.
         seed: the seed.
         reason: why it has no results; None for a finished run.
-        metrics: `Metric` fields by name; empty without results, as are the next three.
-        success: success rate on each task by its label, at the end.
-        returns: mean return on each task in the same way.
-        tasks: labels of the tasks that are not held out.
+        metrics: `Metric` fields by name; empty without results.
+        values: everything that tables show of it; empty if the log cannot be read.
         history: curves and performance; None if the log cannot be read.
         shown: place and name that tables and figures give its agent; None: as `grouped` finds them.
     """
@@ -109,11 +132,34 @@ class Run:
     seed: int
     reason: str | None = None
     metrics: Mapping[str, ReadOnlyValues] = field(default_factory=dict)
-    success: Mapping[str, float | None] = field(default_factory=dict)
-    returns: Mapping[str, float | None] = field(default_factory=dict)
-    tasks: Sequence[str] = ()
+    values: Sequence[Value] = ()
     history: History | None = None
     shown: tuple[int, str] | None = None
+
+    @cached_property
+    def success(self) -> Mapping[str, float | None]:
+        """Success rate on each task by its label, at the end; empty without results."""
+        return self._at_end("success_rate")
+
+    @cached_property
+    def returns(self) -> Mapping[str, float | None]:
+        """Mean return on each task by its label, at the end; empty without results."""
+        return self._at_end("return_mean")
+
+    @cached_property
+    def tasks(self) -> Sequence[str]:
+        """Labels of the tasks that are not held out; empty without results."""
+        evaluated = dict.fromkeys(each.task for each in self.values if each.held_out is False)
+        return [task for task in self.returns if task in evaluated]
+
+    def _at_end(self, metric: str) -> dict[str, float | None]:
+        last_block = len(self.about.get("trained") or ()) or max(each.block or 0 for each in self.values)
+        found: dict[str, float | None] = {}
+        for each in self.values if self.metrics else ():
+            if each.metric == metric and each.task is not None:
+                is_last = each.moment != "during" and each.block == last_block
+                found[each.task] = each.value if is_last else found.get(each.task)
+        return found
 
     @property
     def curriculum(self) -> CurriculumKey:
@@ -229,7 +275,7 @@ def read_run(path: Path) -> Run:
     config = dict(about["config"])
     for key in OF_THE_CURRICULUM:
         config.pop(key, None)
-    if _called(config.get("method")) == NO_METHOD:
+    if called(config.get("method")) == NO_METHOD:
         del config["method"]
     seed = config.pop("seed")
     config = as_before(config)
@@ -244,32 +290,22 @@ def read_run(path: Path) -> Run:
         reason = str(error) if isinstance(error, ValueError) else f"{file}: a measurement lacks or misuses {error}"
         return Run(path, about, agent, settings, seed, reason=reason)
     metrics, why = _metrics(path, log)
-    success: dict[str, float | None] = {}
-    returns: dict[str, float | None] = {}
-    tasks: dict[str, None] = {}
-    last_block = len(about.get("trained") or ()) or max(m.get("block", 0) for m in log.measurements)
-    for m in log.of_kind("evaluation") if metrics else ():
-        label = label_of(m)
-        success.setdefault(label, None)
-        returns.setdefault(label, None)
-        if not m.get("held_out"):
-            tasks[label] = None
-        if m.get("moment") != "during" and m["block"] == last_block:
-            success[label] = m.get("success_rate")
-            returns[label] = m.get("return_mean")
-    return Run(
-        path,
-        about,
-        agent,
-        settings,
-        seed,
-        reason=why,
-        metrics=metrics,
-        success=success,
-        returns=returns,
-        tasks=list(tasks),
-        history=history,
-    )
+    values = list(_values(log, metrics))
+    return Run(path, about, agent, settings, seed, reason=why, metrics=metrics, values=values, history=history)
+
+
+def _values(log: RunLog, metrics: ReadOnlyValues) -> Iterator[Value]:
+    """Yield what a run measured in the order of its log, then its metrics."""
+    for m in log.measurements:
+        prefix, names = MEASURES.get(m["kind"], ("", ()))
+        is_task = "task" in m
+        task = label_of(m) if is_task else None
+        held_out = bool(m.get("held_out")) if is_task else None
+        for name in names:
+            place = (m["block"], m.get("moment"), m["frames"], m.get("step"))
+            yield Value(task, held_out, *place, metric=prefix + name, value=m.get(name))
+    for name, metric in metrics.items():
+        yield Value(*NOWHERE, metric=name, value=metric["value"])
 
 
 def _about(file: Path) -> NamedValues:
@@ -297,13 +333,13 @@ def _about(file: Path) -> NamedValues:
 def _agent(config: ReadOnlyValues) -> str | None:
     """Return agent, cell if not the usual one, method and detector, by their classes or the recorder's names."""
     learner = config.get("agent")
-    agent = _called(learner) or _called(config.get("learner"))
-    cell = _called(learner.get("cell")) if isinstance(learner, Mapping) else None
-    parts = (agent, cell, _called(config.get("method")), _called(config.get("detector")))
+    agent = called(learner) or called(config.get("learner"))
+    cell = called(learner.get("cell")) if isinstance(learner, Mapping) else None
+    parts = (agent, cell, called(config.get("method")), called(config.get("detector")))
     return " + ".join(filter(None, parts)) if agent else agent
 
 
-def _called(part: Any) -> str | None:
+def called(part: Any) -> str | None:
     """Return the class that a part of a configuration builds, or the part itself if it is a name."""
     if isinstance(part, Mapping) and "_target_" in part:
         return str(part["_target_"]).rpartition(".")[2]

@@ -1,0 +1,107 @@
+"""Finished runs as one tidy table: a row for each number that a run measured."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from ctgraph_rl.checks import require
+from ctgraph_rl.report.style import require_packages
+from ctgraph_rl.runs.read import FOLDER, NO_METHOD, Run, called, find_runs, grouped, present
+
+if TYPE_CHECKING:
+    import pandas
+
+
+class FrameRow(NamedTuple):
+    """A row of `results`: the run, and one number of it."""
+
+    run: str
+    agent: str
+    method: str
+    settings: str
+    learner: str
+    curriculum: str
+    fingerprint: str
+    numbers_version: int
+    seed: int
+    task: str | None
+    held_out: bool | None
+    block: int | None
+    moment: str | None
+    frames: int | None
+    episode: int | None
+    metric: str
+    value: float | None
+
+
+DTYPES = {
+    **dict.fromkeys(FrameRow._fields, "category"),
+    **dict.fromkeys(("numbers_version", "seed"), "int64"),
+    **dict.fromkeys(("block", "frames", "episode"), "Int64"),
+    "held_out": "boolean",
+    "value": "float64",
+}
+
+
+def results(paths: Path | str | Sequence[Path | str]) -> pandas.DataFrame:
+    """Return every number of finished runs as one tidy table, a row each.
+
+    The columns are:
+
+    - ``run``, ``agent``, ``method``, ``settings``, ``learner``, ``curriculum``, ``fingerprint``: category. ``settings``
+      is JSON. ``learner`` is the agent's name in the tables of ``ctgraph-rl results``, ``method`` is ``Finetune`` where
+      there is none.
+    - ``numbers_version``, ``seed``: int64.
+    - ``task``: category, the task's label; ``held_out``: boolean, whether no block trains it.
+    - ``block``: Int64, 0 before any training; ``moment``: category, ``before``, ``during`` or ``after`` the block.
+    - ``frames``: Int64, learned so far; ``episode``: Int64, of a row that adapts, from 1.
+    - ``metric``: category; ``value``: float64, NaN where a metric is undefined.
+
+    Metrics of evaluations are ``return_mean`` and ``success_rate``. Those of training intervals begin with
+    ``training_`` and have no task, those of rows that adapt begin with ``adaptation_``. All others are of the whole
+    run, see ``docs/reference/metrics.md``, and have neither task nor block. Missing values mean that a column says
+    nothing about a row.
+
+    Args:
+        paths: run directories, or folders that hold them. Single-task experts are left out where there are other runs.
+
+    Warns:
+        UserWarning: for each run that is left out: one that is unfinished, broken, or there twice.
+
+    Raises:
+        ModuleNotFoundError: without pandas; names the extra to install.
+        ValueError: if no run is finished.
+
+    Example:
+        >>> frame = results("runs")  # doctest: +SKIP
+        >>> last = frame[frame.metric == "average_performance"]  # doctest: +SKIP
+        >>> last.groupby("learner").value.agg(["mean", "std", "count"])  # doctest: +SKIP
+    """
+    require_packages("results", "pandas")
+    import pandas
+
+    runs, problems = find_runs([paths] if isinstance(paths, (str, Path)) else paths)
+    finished = [run for run in runs if run.reason is None]
+    unfinished = [f"{run.path}: {run.reason}" for run in runs if run.reason is not None]
+    left_out = [*(problem.reason for problem in problems), *unfinished]
+    require((bool(finished), f"no run is finished: {'; '.join(left_out)}"))
+    for reason in left_out:
+        warnings.warn(f"left out: {reason}", stacklevel=2)
+    return pandas.DataFrame(rows(finished), columns=FrameRow._fields).astype(DTYPES)
+
+
+def rows(runs: Sequence[Run]) -> Iterator[FrameRow]:
+    """Yield the rows of runs, in the order of tables."""
+    for (_, learner), by_seed in grouped(runs).items():
+        for run in present(by_seed):
+            config = run.about["config"]
+            agent = called(config.get("agent")) or called(config.get("learner")) or Path(run.settings[FOLDER]).name
+            settings = json.dumps(run.settings, sort_keys=True)
+            names = (str(run.path), agent, called(config.get("method")) or NO_METHOD, settings, learner)
+            number = (run.code["numbers version"], run.seed)
+            for value in run.values:
+                yield FrameRow._make((*names, *run.curriculum, *number, *value))
