@@ -20,7 +20,7 @@ from ctgraph_rl.checks import nearest, takes_its_kinds
 if TYPE_CHECKING:
     from ctgraph_rl.tasks.curriculum import Curriculum
 
-_MODULES = ("adaptation", "gym", "masks", "memory", "nested", "paper", "profile", "sharing", "task_free")
+_MODULES = ("adaptation", "gym", "masks", "memory", "paper", "profile", "sharing", "task_free")
 """Each has a table ``NAMED`` of its curricula by name."""
 
 _HOMES = {"MISSING": "published", "from_axes": "configured", "from_meta_json": "meta_json", "sequence": "order"}

@@ -16,6 +16,9 @@ from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from ctgraph_rl.tasks.task import Task
 from curricula.order import Tasks, sequence
 
+NamedTasks = list[tuple[int, str]]
+"""Tasks as the labs write them: image seed, and path."""
+
 GoalPool = Sequence[tuple[int, int]]
 """(image seed, depth) of each environment whose goals the labs number one after the other."""
 
@@ -82,22 +85,19 @@ def goal_of(path: str) -> tuple[int, ...]:
 
 def one_wait_image(path: str, image_seed: int) -> Task:
     """A task of the labs' ``pomdp_wait`` environments: one image for all wait states, one for each other state."""
-    depth = len(path)
     n = 2 ** len(path)
-    unique = (True, False)
-    config = environment(depth, (2, 2), (3, n + 1), (n + 2, 2 * n + 1), image_seed, unique=unique)
+    config = environment(len(path), (2, 2), (3, n + 1), (n + 2, 2 * n + 1), image_seed, unique=(True, False))
     return Task.from_json(config, goal_of(path))
 
 
 def full_mdp(path: str, image_seed: int, fail_reward: float = 0.0, one_hot: bool = False) -> Task:
     """A task of the labs' fully observable environments: an image, or a vector, for each state."""
-    depth = len(path)
     n = 2 ** len(path)
     ids = (2, 2 * n), (2 * n + 1, 3 * n - 1), (3 * n, 4 * n - 1)
-    return Task.from_json(environment(depth, *ids, image_seed, fail_reward, one_hot=one_hot), goal_of(path))
+    return Task.from_json(environment(len(path), *ids, image_seed, fail_reward, one_hot=one_hot), goal_of(path))
 
 
-def words(listing: str) -> list[tuple[int, str]]:
+def words(listing: str) -> NamedTasks:
     """``1:01 2:11`` as image seeds and paths."""
     pairs = [word.split(":") for word in listing.split()]
     return [(int(seed), path) for seed, path in pairs]
@@ -121,7 +121,6 @@ def labelled(
     num_task_ids: int,
     num_frames: int,
     evaluation: Evaluation = MASK_EVALUATION,
-    version: int = 1,
 ) -> Curriculum:
     """A block for each task, announced, with a one-hot task id.
 
@@ -133,11 +132,10 @@ def labelled(
         num_task_ids: length of the one-hot id.
         num_frames: frames of each block.
         evaluation: how performance is measured.
-        version: raised when the content changes.
     """
     by_task = one_id_each(tasks, ids)
     protocol = Protocol("one_hot", num_task_ids=num_task_ids, task_ids=tuple(by_task.values()))
-    return sequence(name, tasks, num_frames, version=version, source=source, protocol=protocol, evaluation=evaluation)
+    return sequence(name, tasks, num_frames, source=source, protocol=protocol, evaluation=evaluation)
 
 
 def one_id_each(tasks: Tasks, ids: Sequence[int]) -> Mapping[Task, int]:
