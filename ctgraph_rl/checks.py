@@ -52,10 +52,7 @@ def require(*rules: Rule) -> None:
 
 
 def nearest(word: str, choices: Iterable[str]) -> str | None:
-    """Return the choice that a misspelt word probably stands for, ignoring case; None if none is near.
-
-    Initials count as a name, such as ``lr`` for ``learning_rate``; a part of a single name counts, too.
-    """
+    """Return the choice that a misspelt word, its initials or a part of it stand for; None if none is near."""
     known = {choice.lower().replace("-", "_"): choice for choice in choices}
     initials = []
     parts = []
@@ -79,24 +76,19 @@ def as_int(action: object) -> int:
 
 
 def did_you_mean(word: str, choices: Iterable[str]) -> str:
-    """Return the end of a message about a word that is not among the choices: the nearest one, or else all."""
+    """Return the end of a message about a word that is no choice: the nearest choice, or all."""
     choices = list(choices)
     near = nearest(word, choices)
     return f"did you mean {near!r}?" if near is not None else f"choices: {', '.join(choices) or 'none'}"
 
 
 def memory_bytes() -> int:
-    """Return the memory of this machine; without a limit where the system does not say."""
+    """Return the bytes of this machine's memory; a huge number where the system does not say."""
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else sys.maxsize
 
 
 def require_memory(what: str, needed: int, fewer: str) -> None:
-    """Refuse what cannot be held, before anything is allocated; POSIX systems only.
-
-    Args:
-        what: needs memory.
-        needed: bytes at least.
-        fewer: of what to use fewer.
+    """Refuse what needs more bytes than the machine's memory has; ``fewer`` says of what to use fewer.
 
     Raises:
         ValueError: if the machine has less memory.
@@ -169,10 +161,7 @@ def _plain(value: Any, whole: bool) -> Any:
 
 
 def make_fields_plain(instance: Any) -> None:
-    """Replace the numbers and arrays in the fields of a frozen dataclass by plain ones, see `plain`.
-
-    What is given for a tuple, such as a list of a yaml file, becomes one.
-    """
+    """Make the numbers and arrays in the fields of a frozen dataclass `plain`, and lists given for a tuple tuples."""
     for each in fields(instance):
         if each.init:
             value = plain(getattr(instance, each.name), whole=_is_whole(each.type))
@@ -182,7 +171,7 @@ def make_fields_plain(instance: Any) -> None:
 
 
 def takes_numbers(function: Function) -> Function:
-    """Give a function plain numbers, see `plain`, for arguments that are annotated as numbers and those of ``**``."""
+    """Give a function `plain` numbers for arguments that are annotated as numbers and those of ``**``."""
     parameters = signature(function).parameters
     names = list(parameters)
     wholes = {name: _is_whole(each.annotation) for name, each in parameters.items() if _is_number(each)}
@@ -214,39 +203,31 @@ KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
 
 
 def takes_its_kinds(function: Function) -> Function:
-    """Give a function plain numbers, see `takes_numbers`, and refuse values of other kinds than are annotated.
-
-    So what a function does not use is not silently accepted. Annotations with other names than `KINDS` say nothing.
-    """
+    """As `takes_numbers`, and refuse values of other kinds than are annotated with names of `KINDS`."""
     shape = signature(function)
     checked = {}
     for name, parameter in shape.parameters.items():
-        kinds = _kinds(parameter)
+        kinds = [kind.partition("[")[0] for kind in re.split(r" \| (?![^\[]*\])", str(parameter.annotation))]
         if set(kinds) <= set(KINDS):
-            checked[name] = kinds
+            checked[name] = [KINDS[kind] for kind in kinds]
 
     @wraps(function)
     def called(*args: Any, **kwargs: Any) -> Any:
-        given = shape.bind(*args, **kwargs).arguments
-        require(*(_kind_rule(name, given[name], checked[name]) for name in given if name in checked))
+        rules = []
+        for name, value in shape.bind(*args, **kwargs).arguments.items():
+            kinds = checked.get(name)
+            if kinds is not None:
+                words = " or ".join(word for word, _ in kinds)
+                rules.append((any(fits(value) for _, fits in kinds), f"{name} must be {words}, got {value!r}"))
+        require(*rules)
         return function(*args, **kwargs)
 
     called.__module__ = getattr(function, "func", function).__module__  # a partial function is not one of functools
     return takes_numbers(called)  # type: ignore[return-value]
 
 
-def _kinds(parameter: Parameter) -> list[str]:
-    kinds = re.split(r" \| (?![^\[]*\])", str(parameter.annotation))
-    return [kind.partition("[")[0] for kind in kinds]
-
-
-def _kind_rule(name: str, value: object, kinds: list[str]) -> Rule:
-    fits = any(KINDS[kind][1](value) for kind in kinds)
-    return fits, f"{name} must be {' or '.join(KINDS[kind][0] for kind in kinds)}, got {value!r}"
-
-
 class TakesNumbers:
-    """The base of classes whose constructors take numbers of NumPy and torch, too, see `takes_numbers`."""
+    """The base of classes whose constructors take numbers of NumPy and torch, too."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -260,7 +241,7 @@ def _is_number(parameter: Parameter) -> bool:
 
 
 def _is_whole(annotation: object) -> bool:
-    """Return whether an annotation says an integer, or else several; goals and other lists of integers are none."""
+    """Return whether an annotation begins with ``int`` and allows no float."""
     return annotation is int or (str(annotation).startswith("int") and "float" not in _words(annotation))
 
 
@@ -305,14 +286,11 @@ def is_shallow(value: object, levels: int) -> bool:
 
 def at_least_one(**values: object) -> list[Rule]:
     """Rules that each named value is an integer in 1..2**63 - 1."""
-    return [
-        (is_int(value, 1, LARGEST_INT), f"{name} must be an integer {_limit(value)}, got {value!r}")
-        for name, value in values.items()
-    ]
-
-
-def _limit(value: object) -> str:
-    return "< 2**63" if is_int(value, 1) else ">= 1"
+    rules = []
+    for name, value in values.items():
+        limit = "< 2**63" if is_int(value, 1) else ">= 1"
+        rules.append((is_int(value, 1, LARGEST_INT), f"{name} must be an integer {limit}, got {value!r}"))
+    return rules
 
 
 def _rules(holds: Callable[[Any], bool], what: str, values: Mapping[str, object]) -> list[Rule]:
@@ -353,6 +331,8 @@ def true_or_false(**values: object) -> list[Rule]:
 def as_tuple(value: object) -> object:
     """A list-like value as a tuple of plain values (yaml has only lists); anything else unchanged."""
     value = plain(value)
+    if isinstance(value, (list, tuple)):
+        return tuple(value)
     if isinstance(value, Iterable) and not isinstance(value, (str, bytes, dict, set, frozenset)):
         return tuple(map(plain, value))
     return value

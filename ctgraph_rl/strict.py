@@ -13,7 +13,7 @@ import os
 import re
 import stat
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -200,7 +200,10 @@ def files_below(folder: Path, names: Sequence[str] = ()) -> tuple[list[Path], li
     waiting = [(folder, 0)]
     while waiting:
         where, depth = waiting.pop()
-        for entry in _entries(where):
+        entries: list[os.DirEntry[str]] = []
+        with suppress(OSError), os.scandir(where) as found:
+            entries = list(found)
+        for entry in entries:
             if entry.is_dir(follow_symlinks=False):
                 if depth + 1 < MAX_DEPTH:
                     waiting.append((where / entry.name, depth + 1))
@@ -212,7 +215,7 @@ def files_below(folder: Path, names: Sequence[str] = ()) -> tuple[list[Path], li
 
 
 def one_line_of(error: Exception, file: Path) -> str:
-    """Return why something cannot be read, in one line; of an error that no rule foresees, also its kind."""
+    """Return why a file cannot be read, with the kind of an error that no rule foresees."""
     foreseen = isinstance(error, (OSError, ValueError)) and not isinstance(error, UnicodeError)
     said = " ".join(str(error).split())
     return said if foreseen else f"{file} cannot be read ({type(error).__name__}: {said:.200})"
@@ -223,42 +226,14 @@ def too_deep(folder: Path) -> str:
     return f"{folder} is more than {MAX_DEPTH} folders deep, and is not looked into: name it, or one above it"
 
 
-def _entries(folder: Path) -> list[os.DirEntry[str]]:
-    """Return what is in a folder; nothing where it cannot be read."""
-    try:
-        with os.scandir(folder) as entries:
-            return list(entries)
-    except OSError:
-        return []
-
-
-def measure_size(path: Path) -> int:
-    """Return the bytes of a regular file.
+def sha256_of(path: Path, most: int) -> str:
+    """Return the SHA-256 of a regular file, which is not read into memory as a whole.
 
     Raises:
-        ValueError: for what is no regular file.
+        ValueError: for what is no regular file, and one of more than ``most`` bytes.
     """
     found = path.lstat()
     require((stat.S_ISREG(found.st_mode), f"{path} must be a regular file"))
-    return found.st_size
-
-
-def blocks_of(path: Path, most: int) -> Iterator[bytes]:
-    """Yield the content of a regular file in parts.
-
-    Raises:
-        ValueError: for one of more than ``most`` bytes.
-    """
-    size = measure_size(path)
-    require((size <= most, f"{path} has {size:,} bytes, the limit is {most:,}"))
+    require((found.st_size <= most, f"{path} has {found.st_size:,} bytes, the limit is {most:,}"))
     with path.open("rb") as file:
-        while part := file.read(2**20):
-            yield part
-
-
-def sha256_of(path: Path, most: int) -> str:
-    """Return the SHA-256 of a regular file of at most ``most`` bytes, which is not read into memory as a whole."""
-    found = hashlib.sha256()
-    for part in blocks_of(path, most):
-        found.update(part)
-    return found.hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()

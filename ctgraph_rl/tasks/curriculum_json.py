@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from difflib import get_close_matches
-from functools import partial
+from itertools import chain
 from os import PathLike
 from os.path import lexists
 from typing import TYPE_CHECKING, Any
@@ -52,14 +52,35 @@ MAX_NESTING = 16
 MAX_BANK_BYTES = 2**36
 """Most that the images of one task may need: 64 GiB."""
 
+_GRAPH_FACTS = (
+    "num_states",
+    "num_end_states",
+    "reward_prob_random",
+    "expected_episode_length",
+)
+"""Numbers that follow from a graph."""
+
 _KEYS = ("schema", "fingerprint", "name", "version", "source", "tasks", "blocks", "evaluation", "protocol")
 _DERIVED = "about"
 
-_CHOSEN = (*IMAGE_SETS, *REWARD_FNS.values(), *SWITCHES, TupleArgument, DictArgument)
-"""Types of which a curriculum has one of several, so that JSON names it."""
+_CHOICES: dict[tuple[type, str], tuple[type, ...]] = {
+    (Task, "images"): IMAGE_SETS,
+    (Task, "reward_fn"): tuple(REWARD_FNS.values()),
+    (Block, "switch"): SWITCHES,
+}
+"""Fields that hold one of several types, so that JSON names it."""
 
-_OURS = (*_CHOSEN, Task, CTGraph, Observations, Block, Evaluation, Protocol)
+_PARTS: dict[tuple[type, str], type] = {(Task, "graph"): CTGraph, (Task, "observations"): Observations}
+"""Fields that hold always the same type."""
+
+_OF_TASKS = ((Block, "tasks"), (Evaluation, "held_out"))
+_OF_ARGUMENTS = ((GymTask, "kwargs"), (GymTask, "wrappers"))
+
+_NAMED_TYPES = (*chain.from_iterable(_CHOICES.values()), TupleArgument, DictArgument)
+
+_OURS = (*_NAMED_TYPES, *_PARTS.values(), Task, Block, Evaluation, Protocol)
 """All types in the JSON of a curriculum of CT-graphs."""
+
 
 TASK_KINDS: dict[str, type] = {GymTask.__name__: GymTask}
 """Kinds of tasks of this package by name, beside `Task`, whose JSON names none."""
@@ -76,7 +97,7 @@ def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = 
         "name": curriculum.name,
         "version": curriculum.version,
         "source": curriculum.source,
-        "tasks": [_plain_task(task) for task in places],
+        "tasks": [_task_as_json(task) for task in places],
         "blocks": _plain(curriculum.blocks, places),
         "evaluation": _plain(curriculum.evaluation, places),
         "protocol": _plain(curriculum.protocol, places),
@@ -85,7 +106,11 @@ def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = 
         _check_form(content)
     about = []
     for label, task in zip(curriculum.labels, curriculum.tasks, strict=True):
-        about.append({"label": label} | _of_graph(task))
+        facts: NamedValues = {"label": label}
+        if isinstance(task, Task):
+            facts["goal_leaf"] = task.goal_leaf
+            facts |= {name: getattr(task.graph, name) for name in _GRAPH_FACTS}
+        about.append(facts)
     written_by = f"ctgraph_rl {__version__}"
     content[_DERIVED] = {"written_by": written_by, "num_frames": curriculum.num_frames, "tasks": about}
     if path is not None:
@@ -105,7 +130,15 @@ def read_curriculum(path_or_dict: str | PathLike[str] | ReadOnlyValues, make: Ca
         require((not is_int(schema, SCHEMA + 1), newer))
         _check_keys(content, _KEYS)
         require((schema == SCHEMA, f"schema must be {SCHEMA}, got {schema!r}"))
-        curriculum = make(**_parts(content))
+        require((isinstance(content["source"], str), f"source must be a text, got {content['source']!r:.80}"))
+        tasks = _each("tasks", content["tasks"], _task)
+        blocks = _each("blocks", content["blocks"], lambda block: _built(Block, block, tasks))
+        with _within("evaluation"):
+            evaluation = _built(Evaluation, content["evaluation"], tasks)
+        with _within("protocol"):
+            protocol = _built(Protocol, content["protocol"])
+        name = content["name"]
+        curriculum = make(name, content["version"], content["source"], tuple(blocks), evaluation, protocol=protocol)
         stated = content["fingerprint"]
         found = curriculum.fingerprint
         fix = f"if the change is intended, write {found!r} there, and a new version and name"
@@ -114,27 +147,24 @@ def read_curriculum(path_or_dict: str | PathLike[str] | ReadOnlyValues, make: Ca
 
 
 def _plain(value: Any, places: Mapping[TaskLike, int]) -> Any:
-    """One of our values as JSON, tasks by their places where these are given."""
+    """Return one of our values as JSON, tasks by their places where these are given."""
     if places and value in places:
         return places[value]
     if isinstance(value, tuple):
         return [_plain(item, places) for item in value]
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
-    require((type(value) in _OURS, f"JSON holds only types of this package, got {value!r}; exchange it as Python"))
-    return ({"type": type(value).__name__} if type(value) in _CHOSEN else {}) | _plain_fields(value, places)
+    kind = type(value)
+    require((kind in _OURS, f"JSON holds only types of this package, got {value!r}; exchange it as Python"))
+    content: NamedValues = {"type": kind.__name__} if kind in _NAMED_TYPES else {}
+    return content | {name: _plain(getattr(value, name), places) for name in _names(kind)}
 
 
-def _plain_fields(value: Any, places: Mapping[TaskLike, int]) -> NamedValues:
-    return {name: _plain(getattr(value, name), places) for name in _names(type(value))}
-
-
-def _plain_task(task: TaskLike) -> NamedValues:
+def _task_as_json(task: TaskLike) -> NamedValues:
     """Return a task as JSON; a kind beside `Task` is named."""
     kind = type(task)
-    if kind is Task:
-        return _plain(task, {})
-    return {"type": type_name(kind)} | _plain_fields(task, {})
+    content: NamedValues = {} if kind is Task else {"type": type_name(kind)}
+    return content | {name: _plain(getattr(task, name), {}) for name in _names(kind)}
 
 
 def type_name(kind: type) -> str:
@@ -145,20 +175,6 @@ def type_name(kind: type) -> str:
 def _names(kind: type) -> list[str]:
     """The fields that one of our classes is made of."""
     return [field.name for field in fields(kind) if field.init]
-
-
-def _of_graph(task: TaskLike) -> NamedValues:
-    """Return numbers that follow from a CT-graph."""
-    if not isinstance(task, Task):
-        return {}
-    graph = task.graph
-    return {
-        "goal_leaf": task.goal_leaf,
-        "num_states": graph.num_states,
-        "num_end_states": graph.num_end_states,
-        "reward_prob_random": graph.reward_prob_random,
-        "expected_episode_length": graph.expected_episode_length,
-    }
 
 
 def file_text(content: ReadOnlyValues) -> str:
@@ -215,36 +231,16 @@ def _check_keys(content: Any, names: Sequence[str], optional: Sequence[str] = ()
     )
 
 
-def _parts(content: ReadOnlyValues) -> NamedValues:
-    """Return the arguments of a curriculum."""
-    require((isinstance(content["source"], str), f"source must be a text, got {content['source']!r:.80}"))
-    tasks = _each("tasks", content["tasks"], _task)
-    positions = partial(_tasks_at, tasks)
-    block = partial(_built, Block, readers={"tasks": positions, "switch": partial(_chosen, SWITCHES, or_none=True)})
-    blocks = _each("blocks", content["blocks"], block)
-    with _within("evaluation"):
-        evaluation = _built(Evaluation, content["evaluation"], {"held_out": positions})
-    with _within("protocol"):
-        protocol = _built(Protocol, content["protocol"], {})
-    return {
-        "name": content["name"],
-        "version": content["version"],
-        "source": content["source"],
-        "blocks": tuple(blocks),
-        "evaluation": evaluation,
-        "protocol": protocol,
-    }
-
-
 def _task(content: Any) -> TaskLike:
     if not isinstance(content, Mapping) or "type" not in content:
-        return _graph(content)
-    kind = _kind(content["type"])
-    arguments = {"kwargs": from_json, "wrappers": from_json} if kind is GymTask else {}
-    task = _built(kind, _without_type(content), arguments)
+        task = _built(Task, content)
+        needed = bank_bytes([task])
+        require((needed <= MAX_BANK_BYTES, f"images need {needed:,} bytes, the limit is {MAX_BANK_BYTES:,}; use fewer"))
+        return task
+    task = _built(_kind(content["type"]), _without_type(content))
     known = ("ctgraph_rl", "curricula", "gymnasium")
-    needed = [name for name in getattr(task, "modules", ()) if name not in sys.modules]
-    unknown = [name for name in needed if name.partition(".")[0] not in known]
+    missing = [name for name in getattr(task, "modules", ()) if name not in sys.modules]
+    unknown = [name for name in missing if name.partition(".")[0] not in known]
     fix = "import them first, as nothing of a file is imported"
     require((not unknown, f"the task needs the modules {', '.join(unknown)}: {fix}"))
     return task
@@ -263,19 +259,6 @@ def _kind(name: Any) -> type:
     return kind  # type: ignore[return-value]
 
 
-def _graph(content: Any) -> Task:
-    parts = {
-        "graph": partial(_built, CTGraph, readers={}),
-        "observations": partial(_built, Observations, readers={}),
-        "images": partial(_chosen, IMAGE_SETS),
-        "reward_fn": partial(_chosen, [*REWARD_FNS.values()]),
-    }
-    task = _built(Task, content, parts)
-    needed = bank_bytes([task])
-    require((needed <= MAX_BANK_BYTES, f"images need {needed:,} bytes, the limit is {MAX_BANK_BYTES:,}; use fewer"))
-    return task
-
-
 def _each(name: str, content: Any, read: Callable[[Any], Any]) -> list[Any]:
     """Every item of a list, read."""
     require((isinstance(content, list), f"{name} must be a list, got {content!r:.80}"))
@@ -286,35 +269,39 @@ def _each(name: str, content: Any, read: Callable[[Any], Any]) -> list[Any]:
     return items
 
 
-def _built(kind: type, content: Any, readers: Mapping[str, Callable[[Any], Any]]) -> Any:
-    """An object of one of our classes from its fields; ``readers`` turn some of them into parts first."""
+def _built(kind: type, content: Any, tasks: Sequence[TaskLike] = ()) -> Any:
+    """Return an object of a class from its fields; those that hold tasks name them by their places."""
     added = [field.name for field in fields(kind) if field.metadata.get("added")]
     _check_keys(content, [name for name in _names(kind) if name not in added], added)
-    arguments = dict(content)
-    for name, read in readers.items():
+    arguments = {}
+    for name, item in content.items():
         with _within(name):
-            arguments[name] = read(content[name])
+            arguments[name] = _field((kind, name), item, tasks)
     return kind(**arguments)
 
 
-def _chosen(kinds: Sequence[type], content: Any, or_none: bool = False) -> Any:
-    """An object of the class that its ``type`` names."""
-    if content is None and or_none:
-        return None
+def _field(place: tuple[type, str], content: Any, tasks: Sequence[TaskLike]) -> Any:
+    """Return the value of a field of a class."""
+    if place in _PARTS:
+        return _built(_PARTS[place], content)
+    if place in _CHOICES and (content is not None or place != (Block, "switch")):
+        return _chosen(_CHOICES[place], content)
+    if place in _OF_TASKS:
+        holds = are_ints(content, 0, len(tasks) - 1)
+        require((holds, f"must be positions in the list of {len(tasks)} tasks, from 0, got {content!r:.80}"))
+        return tuple(tasks[i] for i in content)
+    return from_json(content) if place in _OF_ARGUMENTS else content
+
+
+def _chosen(kinds: Sequence[type], content: Any) -> Any:
+    """Return an object of the class that its ``type`` names."""
     require((isinstance(content, Mapping), f"must be an object with a type, got {content!r:.80}"))
     names = by_name(*kinds)
     given = content.get("type")
     known = isinstance(given, str) and given in names
     require((known, f"type must be one of {', '.join(names)}, got {given!r:.80}"))
-    return _built(names[given], _without_type(content), {})
+    return _built(names[given], _without_type(content))
 
 
 def _without_type(content: ReadOnlyValues) -> NamedValues:
     return {key: item for key, item in content.items() if key != "type"}
-
-
-def _tasks_at(tasks: Sequence[TaskLike], positions: Any) -> tuple[TaskLike, ...]:
-    """The tasks at positions in the list of tasks."""
-    holds = are_ints(positions, 0, len(tasks) - 1)
-    require((holds, f"must be positions in the list of {len(tasks)} tasks, from 0, got {positions!r:.80}"))
-    return tuple(tasks[i] for i in positions)
