@@ -294,7 +294,6 @@ def at_least_one(**values: object) -> list[Rule]:
 
 
 def _rules(holds: Callable[[Any], bool], what: str, values: Mapping[str, object]) -> list[Rule]:
-    """Rules that each named value must be something."""
     return [(holds(value), f"{name} must be {what}, got {value!r}") for name, value in values.items()]
 
 

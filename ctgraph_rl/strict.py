@@ -101,7 +101,6 @@ def json_object(
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> NamedValues:
-    """Return an object; refuse one that has a key twice."""
     twice = repeated(key for key, _ in pairs)
     require((not twice, f"key {''.join(twice[:1])!r:.80} occurs twice in one object"))
     return dict(pairs)
@@ -143,7 +142,6 @@ class _Plain(yaml.SafeLoader):
         return node
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        """Return the values by keys."""
         found: dict[Any, Any] = {}
         for key_node, value_node in node.value:
             require((isinstance(key_node, yaml.ScalarNode), "a key must be a text or a number"))
@@ -153,7 +151,6 @@ class _Plain(yaml.SafeLoader):
         return found
 
     def construct_number(self, node: Any) -> Any:
-        """Return an integer or a float in decimal digits."""
         text = self.construct_scalar(node)
         shown = f"{text:.40} is a number to some programs, a text to others: put it in quotes, or write decimal digits"
         require(

@@ -23,7 +23,6 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _compute(arguments: argparse.Namespace) -> None:
-    """Do what needs the curricula themselves."""
     from ctgraph_rl import describe  # here: a list of what is published needs no torch
 
     if arguments.command == "probabilities":

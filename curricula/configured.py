@@ -212,7 +212,6 @@ def _by_seed(
 
 
 def _check_goals(goals: object, depths: tuple[int, ...]) -> None:
-    """Goals are named or listed, and the lengths of listed ones are the depths."""
     if isinstance(goals, str):
         require((goals in GOALS, f"goals must be one of {', '.join(GOALS)}, or a list of goals, got {goals!r}"))
         return
@@ -225,7 +224,6 @@ def _check_goals(goals: object, depths: tuple[int, ...]) -> None:
 
 
 def _with_goals(task: Task, goals: str | Sequence[Sequence[int]], num_goals: int, seed: int) -> Tasks:
-    """A graph with its goals."""
     if goals == "random":
         return axes.random_goals(task, num_goals, seed)
     if isinstance(goals, str):
@@ -234,7 +232,6 @@ def _with_goals(task: Task, goals: str | Sequence[Sequence[int]], num_goals: int
 
 
 def _ordered(by_seed: list[list[Tasks]], order: str, seed: int) -> Tasks:
-    """The tasks of each graph of each image seed in one order."""
     sequences = [axes.concatenate(*graphs) for graphs in by_seed]
     if order == "interleave":
         return axes.interleave(*(sequences if len(sequences) > 1 else by_seed[0]))

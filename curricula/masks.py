@@ -146,8 +146,6 @@ LISTED = {
 
 
 def _listed(name: str, row: Listed) -> Callable[..., Curriculum]:
-    """Return the function of a sequence of the table."""
-
     def make(num_frames: int = row.num_frames) -> Curriculum:
         return _curriculum(name, row.source, row.tasks, num_frames, row.pool, seed_set=row.seed_set)
 

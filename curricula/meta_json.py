@@ -88,7 +88,6 @@ class Pool:
         self._sizes = tuple(sizes)
 
     def _in_a_row(self, number: int) -> tuple[int, int]:
-        """The environment and the goal of a number."""
         starts = [0, *accumulate(self._sizes)]
         config = bisect_right(starts, number) - 1
         return config, number - starts[config]
@@ -113,7 +112,6 @@ def read_environment(path: Path) -> NamedValues:
 
 
 def _chosen(meta: NamedValues, pool_size: int) -> list[int]:
-    """The numbers of the tasks in the order of the curriculum."""
     listed = meta.get("filter_tasks")
     count = pool_size if listed is None else len(listed)
     count = min(count, meta.get("num_tasks", count))
@@ -138,11 +136,6 @@ def _labels(meta: NamedValues, tasks: Sequence[Task], numbers: list[int]) -> Pro
 
 
 def _read(path: Path) -> NamedValues:
-    """The object that a JSON file holds.
-
-    Raises:
-        ValueError: for anything else, and for more bytes or levels than such a file can need.
-    """
     with _named(path):
         try:
             content = json_value(read_regular(path, MOST_BYTES), finite=False, nesting=MOST_NESTING)
@@ -153,11 +146,6 @@ def _read(path: Path) -> NamedValues:
 
 
 def _within(folder: Path, name: str) -> Path:
-    """Return the path of a file that another file names, which must be in that file's folder, links followed.
-
-    Raises:
-        ValueError: for a path that leads elsewhere.
-    """
     path = folder / name
     inside = "\0" not in name and path.resolve().is_relative_to(folder.resolve())
     require((inside, f"config_paths must be in the folder of the file, got {short(name)}; copy the file there"))
@@ -166,7 +154,6 @@ def _within(folder: Path, name: str) -> Path:
 
 @contextmanager
 def _named(path: Path) -> Iterator[None]:
-    """Errors begin with the file that they are about, the innermost of several."""
     try:
         yield
     except ValueError as error:

@@ -197,7 +197,6 @@ def new_waits(configuration: str, num_frames: int = FRAMES, image_seed: int = 1)
 
 
 def _with_new_images(configuration: str, kind: str, num_frames: int, image_seed: int) -> Curriculum:
-    """One goal; states of a kind get new images with each task."""
     tasks = axes.new_images(one_goal(configuration, image_seed), NUM_VARIATIONS, (kind,))
     version = _version(configuration, has_one_goal=True)
     return _curriculum(f"{configuration}_new_{kind}s", tasks, num_frames, version)

@@ -219,7 +219,6 @@ def _life(name: str, before: Sequence[Task], num_frames: int) -> Curriculum:
 
 
 def _on_graphs(goals: Sequence[tuple[int, ...]], image_seeds: Sequence[int] = (1, 2)) -> tuple[Task, ...]:
-    """Return a goal on each of two fully observable graphs of depth 2."""
     return tuple(ct_graph(2, 2, 0.0, goal, image_seed=seed) for goal, seed in zip(goals, image_seeds, strict=True))
 
 

@@ -87,7 +87,6 @@ def _curriculum(name: str, tasks: list[Task], num_frames: int) -> Curriculum:
 
 
 def _tasks(differ: str, image_seed: int) -> list[Task]:
-    """Return the four tasks."""
     require(*one_of(DIFFER, differ=differ))
     task = ct_fo_b1(image_seed=image_seed)
     seeds = [image_seed + number for number in range(4)]

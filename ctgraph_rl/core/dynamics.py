@@ -319,7 +319,6 @@ def begin(state: RowState, mask: Tensor | None, params: RowParams, uses: Uses) -
 
 
 def _cleared(state: RowState, mask: Tensor, uses: Uses) -> RowState:
-    """Return states with the rows of a mask at home."""
     starts = mask.long()
     keeps = 1 - starts
     nothing = torch.zeros_like(state.reward)

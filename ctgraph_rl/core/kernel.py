@@ -142,7 +142,6 @@ def _found(folder: Path, key: str) -> Path | None:
 
 
 def _key(source: Path, compiler: list[str]) -> str:
-    """What decides the machine code, hashed: the source, the flags, the compiler and the CPU."""
     try:
         version = subprocess.run([*compiler, "--version"], capture_output=True, check=True).stdout
     except (OSError, subprocess.CalledProcessError) as error:
@@ -154,7 +153,6 @@ def _key(source: Path, compiler: list[str]) -> str:
 
 
 def _cpu() -> str:
-    """The CPU's model and instructions."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
     wanted = ("model name", "flags", "Features", "CPU part")
@@ -162,7 +160,6 @@ def _cpu() -> str:
 
 
 def _cache_folder() -> Path:
-    """The user's own folder for compiled kernels."""
     parent = os.environ.get("XDG_CACHE_HOME")
     folder = (Path(parent) if parent else Path.home() / ".cache") / "ctgraph_rl"
     try:
@@ -176,7 +173,6 @@ def _cache_folder() -> Path:
 
 
 def _require_own(path: Path) -> None:
-    """Refuse what another user could have put there."""
     found = path.stat()
     own = found.st_uid == os.geteuid() and not found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
     require((own, f"{path} must belong to this user and be writable by no other; remove it or set XDG_CACHE_HOME"))

@@ -85,7 +85,6 @@ class Region:
         usual.wait_stream(stream)
 
     def _captured(self) -> torch.cuda.CUDAGraph:
-        """Return the function as a graph, whose memory the results are."""
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph):
             self._results = dict(self.function(dict(self._arguments)))

@@ -161,7 +161,6 @@ def branch_of(node: Tensor, decision: Tensor, swap: Swap | None) -> Tensor:
 
 
 def _look_up(table: Tensor, index: Tensor) -> Tensor:
-    """``table[index]``, much faster."""
     return table.index_select(0, index) if index.ndim == 1 else table[index]
 
 

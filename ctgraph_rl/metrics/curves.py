@@ -93,7 +93,6 @@ class Curves:
 
     @cached_property
     def _own_blocks(self) -> dict[int, list[int]]:
-        """For each task, the blocks that train it, counted from 1."""
         found: dict[int, list[int]] = {}
         for block, tasks in enumerate(self.trained, 1):
             for task in dict.fromkeys(tasks):

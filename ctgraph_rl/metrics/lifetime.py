@@ -358,7 +358,6 @@ def _values_around_training(table: RegimeTable, measure: Measure) -> tuple[Any, 
 
 
 def _saturation(values: Tensor) -> tuple[float, int]:
-    """The highest value of the smoothed curve, and the experiences before it."""
     smoothed = smooth(values)
     level = smoothed.max().item()
     return level, _first_at_least(smoothed, level)
@@ -385,7 +384,6 @@ def _against(table: RegimeTable, experts: Experts, value: Callable[[Sequence[Ten
 
 
 def _ranges(table: RegimeTable, experts: Experts) -> Ranges:
-    """Lowest and highest value of each task and its experts."""
     both = zip(table.names, table.places(training=True), table.places(training=False), strict=True)
     ranges = {}
     for task, own, tests in both:

@@ -203,7 +203,6 @@ def _changes_by_others(performance: Tensor, trained: Trained | None, scale: Tens
 
 
 def _alone(performance: Tensor, trained: Trained | None) -> list[int]:
-    """The one task of each block."""
     blocks = _blocks(performance, trained)
     if any(len(block) != 1 for block in blocks):
         raise Undefined("the definition needs blocks that train one task each")

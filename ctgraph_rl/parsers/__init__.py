@@ -239,7 +239,6 @@ def verify() -> ArgumentParser:
 
 
 def _parser(command: Callable[[], ArgumentParser]) -> ArgumentParser:
-    """Return an empty parser, whose description is what the function that fills it says."""
     return ArgumentParser(prog=f"ctgraph-rl {command.__name__}", description=command.__doc__)
 
 
@@ -249,12 +248,10 @@ def _add(parser: Any, name: str, help: str, type: Any = Path, **how: Any) -> Non
 
 
 def _add_agent(parser: ArgumentParser, about: str = "order and rename agents; repeatable") -> None:
-    """Add the names and the order of agents."""
     parser.add_argument("--agent", action="append", default=[], metavar="NAME[=SHOWN]", help=about)
 
 
 def _add_task(parser: ArgumentParser) -> None:
-    """Add the arguments that name a task and a policy."""
     about = "a configuration of the paper, such as CT-SU-B1; a configuration file of the authors (.json); a curriculum"
     parser.add_argument("name", nargs="?", help=f"{about}. Default: only numbers")
     _add(parser, "--config-dir", "also knows the curricula of this directory", metavar="DIR")
@@ -294,7 +291,6 @@ def decisions(text: str) -> Decisions:
 
 
 def _setting(text: str) -> tuple[str, Any]:
-    """Return a setting of the command line with its value."""
     key, sign, value = text.partition("=")
     if not (key and sign):
         raise argparse.ArgumentTypeError(f"settings are written as in curriculum.depth=4, got {text!r}")

@@ -238,7 +238,6 @@ class Curriculum:
 
 
 def _block_html(number: int, block: Block, labels: Mapping[TaskLike, str]) -> str:
-    """Return a row of the table of a notebook."""
     names = []
     shapes = {}
     for task in dict.fromkeys(block.tasks):
@@ -251,7 +250,6 @@ def _block_html(number: int, block: Block, labels: Mapping[TaskLike, str]) -> st
 
 
 def _some(names: Sequence[str], between: str = ", ") -> str:
-    """Return the first names in one text, and how many more there are."""
     more = [f"{len(names) - SHOWN:,} more"] if len(names) > SHOWN else []
     return between.join([*names[:SHOWN], *more])
 

@@ -173,7 +173,6 @@ def type_name(kind: type) -> str:
 
 
 def _names(kind: type) -> list[str]:
-    """The fields that one of our classes is made of."""
     return [field.name for field in fields(kind) if field.init]
 
 
@@ -195,7 +194,6 @@ def _text(value: Any, margin: str = "\n") -> str:
 
 @contextmanager
 def _within(place: str) -> Iterator[None]:
-    """Say in errors where they are."""
     try:
         yield
     except ValueError as error:
@@ -260,7 +258,6 @@ def _kind(name: Any) -> type:
 
 
 def _each(name: str, content: Any, read: Callable[[Any], Any]) -> list[Any]:
-    """Every item of a list, read."""
     require((isinstance(content, list), f"{name} must be a list, got {content!r:.80}"))
     items = []
     for i, item in enumerate(content):
@@ -281,7 +278,6 @@ def _built(kind: type, content: Any, tasks: Sequence[TaskLike] = ()) -> Any:
 
 
 def _field(place: tuple[type, str], content: Any, tasks: Sequence[TaskLike]) -> Any:
-    """Return the value of a field of a class."""
     if place in _PARTS:
         return _built(_PARTS[place], content)
     if place in _CHOICES and (content is not None or place != (Block, "switch")):

@@ -151,7 +151,6 @@ def _pair_bits(visits: VisitsByLevel, bits: Mapping[StateType, float], task: Tas
 
 
 def _chances(graph: CTGraph, policy: str) -> tuple[float, float]:
-    """The probability that a policy waits at a wait state, and that it decides at a decision state."""
     if policy != "random":
         return 1.0, 1.0
     b = graph.branching_factor
@@ -177,7 +176,6 @@ def _visits(graph: CTGraph, waits: float, decides: float) -> VisitsByLevel:
 
 
 def _count(visits: VisitsByLevel) -> dict[StateType, float]:
-    """Expected visits of each kind of state."""
     return {kind: sum(by_level.values()) for kind, by_level in visits.items()}
 
 

@@ -89,7 +89,6 @@ def read_paper_json(source: str, content: ReadOnlyValues, goal: Sequence[int] | 
 
 
 def _found(source: str, content: ReadOnlyValues) -> Iterator[tuple[str, Any]]:
-    """Yield what a file says, in our words."""
     for written, section in content.items():
         name = written.replace(" ", "_")
         if name == SEED:

@@ -89,7 +89,6 @@ def read_task(path_or_dict: str | PathLike[str] | ReadOnlyValues, goal: Sequence
 
 
 def _places(dialect: str) -> dict[str, tuple[str, str]]:
-    """Section and key of everything that a dialect knows."""
     places = {}
     for name, (section, *keys) in _KEYS.items():
         key = keys[_DIALECTS.index(dialect)]
@@ -99,7 +98,6 @@ def _places(dialect: str) -> dict[str, tuple[str, str]]:
 
 
 def _given(content: ReadOnlyValues) -> list[tuple[str, str]]:
-    """Section and key of everything in the sections of a file."""
     given: list[tuple[str, str]] = []
     for section in _SECTIONS:
         if isinstance(content.get(section), Mapping):
@@ -114,7 +112,6 @@ def _dialect(content: ReadOnlyValues) -> str:
 
 
 def _faults(content: ReadOnlyValues, dialect: str) -> Iterator[str]:
-    """Yield the faults of a file of a dialect: sections and keys that are missing, unknown, or of another dialect."""
     names = (*_SECTIONS, "general_seed")
     for name in content:
         if name not in names:
@@ -138,7 +135,6 @@ def _says_nothing(section: str, key: str, content: ReadOnlyValues) -> bool:
 
 
 def _surplus(section: str, key: str, dialect: str) -> str:
-    """Return the fault of a key that a dialect does not have."""
     here = _places(dialect)
     for other in _DIALECTS:
         for name, place in _places(other).items():
@@ -191,7 +187,6 @@ def _value_rules(found: NamedValues, places: dict[str, tuple[str, str]]) -> list
 
 
 def _arguments(found: NamedValues) -> NamedValues:
-    """Values in our words as arguments of `Task`, all but the goal."""
     changes = found["min_episodes"] > 0
     noise = 0 if found["one_hot"] else found["noise"]
     count = found["num_images"]
@@ -238,7 +233,6 @@ def write_task(task: Task, path: str | PathLike[str] | None, general_seed: int) 
 
 
 def _expressible(task: Task) -> list[Rule]:
-    """Return the rules for tasks that a file of the 2023 dialect can express."""
     x = task.observations
     images = task.images
     unique = x.unique_waits or x.unique_decisions or x.unique_ends

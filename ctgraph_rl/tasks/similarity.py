@@ -170,7 +170,6 @@ def _matrix(items: Sequence[Any], share: Callable[[Any, Any], float]) -> Tensor:
 
 
 def _common(one: Task, other: Task) -> CTGraph:
-    """Return the common tree."""
     b = min(one.graph.branching_factor, other.graph.branching_factor)
     return CTGraph(b, min(one.graph.depth, other.graph.depth))
 
@@ -188,7 +187,6 @@ class _Choices:
 
     @cached_property
     def goal_nodes(self) -> list[int]:
-        """Number of the goal's node within each level."""
         graph = self.task.graph
         nodes = graph.nodes_to(graph.node_at(self.task.goal))
         return [node - graph.first_node(level) for level, node in enumerate(nodes)]
@@ -205,7 +203,6 @@ class _Choices:
         return [sets[ON_THE_WAY if node == goal else ELSEWHERE] if self.collapsed else sets[node] for node in nodes]
 
     def in_use(self, kind: StateType) -> Iterator[int]:
-        """The sets that occur."""
         for (of_kind, level), sets in self.sets.items():
             if of_kind == kind:
                 yield from sets[:1] if level == 0 else sets
@@ -252,7 +249,6 @@ def _best(values: Tensor, fails: float, num_actions: int, first: int, margin: fl
 
 
 def _equal_share(one: _Choices, other: _Choices) -> float:
-    """Share of the states of the common tree with equal sets."""
     tree = _common(one.task, other.task)
     b = tree.branching_factor
     d = tree.depth
@@ -274,8 +270,6 @@ def _equal_on_ways(one: _Choices, other: _Choices, kind: StateType, level: int, 
 
 
 def _equal_everywhere(one: _Choices, other: _Choices, kind: StateType, level: int, b: int) -> int:
-    """Equal states of a level, all visited."""
-
     def sets(choice: _Choices) -> list[int]:
         nodes = _nodes(choice.task.graph.branching_factor, b, level)
         return choice.of_nodes(kind, level, nodes)
@@ -321,7 +315,6 @@ def _shown_with_actions(choice: _Choices) -> Iterator[tuple[Sequence[int], int]]
 
 
 def _ids(task: Task, kind: StateType) -> Sequence[int]:
-    """The ids that states of a kind show."""
     first, last = task.observations.ids(kind)
     if not task.observations.is_unique(kind):
         return range(first, last + 1)
@@ -332,7 +325,6 @@ def _ids(task: Task, kind: StateType) -> Sequence[int]:
 
 
 def _levels(task: Task, kind: StateType) -> range:
-    """Numbers of decisions taken that states of a kind can have."""
     depth = task.graph.depth
     if kind == StateType.WAIT:
         return range(depth + 1)
@@ -340,7 +332,6 @@ def _levels(task: Task, kind: StateType) -> range:
 
 
 def _unique_ids(task: Task, kind: StateType, level: int) -> list[int]:
-    """The ids of the states of a level, in their order."""
     x = task.observations
     graph = task.graph
     states = graph.num_states

@@ -372,8 +372,6 @@ class BestActions:
 
 
 class _WorstActions(BestActions):
-    """The worst choice at every node."""
-
     def at_wait(self, arrival: Tensor, level: int) -> Tensor:
         """Wait until it ends or fail; the choice that is worst once stays worst. float64, as ``arrival``."""
         return self.waiting(arrival).clamp_max(self.failing)
@@ -439,7 +437,6 @@ def _policy_rules(task: Task, policy: Tensor) -> list[Rule]:
 
 
 def _needle_rules(task: Task, ceiling: str) -> list[Rule]:
-    """Return the rules on rewards for which a ceiling is exact."""
     name = type(task.reward_fn).__name__
     goal = task.goal_reward
     fail = task.fail_reward

@@ -160,7 +160,6 @@ class GroupedImages(SquareImages):
 
 @lru_cache(maxsize=16)
 def _paper_images(image_set: PaperImages) -> Tensor:
-    """The first different images of the seed's sequence of candidates."""
     candidates = image_set.num_images
     images = None
     while images is None or len(images) < image_set.num_images:
@@ -181,7 +180,6 @@ def _blueprints(seed: int, count: int) -> Tensor:
 
 
 def _render(blueprints: Tensor, size: int) -> Tensor:
-    """Blueprints as uint8 [count, size, size] images."""
     levels = torch.tensor(BLUEPRINT_LEVELS, dtype=torch.uint8, device="cpu")[blueprints[:, :-1]]
     images = resize(levels.view(-1, BLUEPRINT_SIZE, BLUEPRINT_SIZE), size)
     for which, angle in enumerate(BLUEPRINT_ANGLES):

@@ -77,7 +77,6 @@ class ImageFile:
 
 
 def _read(path: str) -> np.ndarray:
-    """The array of a file, not yet in memory."""
     require((Path(path).is_file(), f"path must be an existing .npy file, got {path!r}"))
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)

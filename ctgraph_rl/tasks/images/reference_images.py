@@ -106,7 +106,6 @@ class ReferenceOneHot(OneHot):
 
 @lru_cache(maxsize=16)
 def _reference_images(image_set: ReferenceImages) -> Tensor:
-    """The images of a set, uint8 [num_images, r, r]."""
     needed = image_set.num_images * image_set.size**2 * _BYTES_OF_A_PIXEL
     require_memory(f"{image_set.num_images:,} images while they are made", needed, "images")
     blueprints, angles = _blueprints(image_set.seed, image_set.num_images)

@@ -120,7 +120,6 @@ class ObservationForm:
         return array.reshape(self.shape).astype(self.dtype)
 
     def _read_integer(self, observation: Any) -> NDArray[Any]:
-        """Return an integer as one-hot."""
         number = read_number(observation, "the observation")
         place = number - int(self.space.start)
         inside = place in range(self.shape[0])
@@ -271,7 +270,6 @@ def _is_shown_rule(space: Any) -> tuple[bool, str]:
 
 
 def _place_of_channels(space: Any) -> str:
-    """Return ``first`` or ``last``, where the channels of an image are."""
     shape = space.shape
     first = shape[-3] in CHANNELS
     last = shape[-1] in CHANNELS

@@ -301,7 +301,6 @@ def _extreme_return(task: GymTask, choose: Callable[..., Any]) -> float:
 
 
 def _frozen_wrapper(wrapper: Any, rule: str) -> Any:
-    """Return the name of a wrapper, or a pair of name and arguments where it is given some."""
     given: Any = ()
     if isinstance(wrapper, partial):
         given = wrapper.keywords
@@ -323,7 +322,6 @@ def _frozen_wrapper(wrapper: Any, rule: str) -> Any:
 
 
 def _wrapped(env: Any, wrapper: Any) -> Any:
-    """Return an environment with a wrapper around it."""
     from gymnasium import Env
 
     name, arguments = (wrapper, ()) if isinstance(wrapper, str) else wrapper

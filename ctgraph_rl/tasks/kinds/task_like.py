@@ -108,7 +108,6 @@ def is_kind(kind: type) -> bool:
 
 
 def _task_rule(kind: type) -> Rule:
-    """Return the rule that a class has the members of `TaskLike`."""
     known = {field.name for field in fields(kind)}
     missing = [name for name in MEMBERS if name not in known and not hasattr(kind, name)]
     if not missing and kind.__hash__ is None:
@@ -118,7 +117,6 @@ def _task_rule(kind: type) -> Rule:
 
 
 def _kinds_rule(tasks: Sequence[object]) -> Rule:
-    """Return the rule that tasks are of one kind."""
     kinds = list(dict.fromkeys(type(task).__name__ for task in tasks))
     return len(
         kinds
