@@ -23,9 +23,15 @@ if TYPE_CHECKING:
 _MODULES = ("adaptation", "gym", "masks", "memory", "paper", "profile", "sharing", "task_free")
 """Each has a table ``NAMED`` of its curricula by name."""
 
-_HOMES = {"MISSING": "published", "from_axes": "configured", "from_meta_json": "meta_json", "sequence": "order"}
+_HOMES = {
+    "MISSING": "published",
+    "from_axes": "configured",
+    "from_graph": "configured",
+    "from_meta_json": "meta_json",
+    "sequence": "order",
+}
 
-__all__ = ["MISSING", "from_axes", "from_meta_json", "load", "names", "sequence", "summary"]
+__all__ = ["MISSING", "from_axes", "from_graph", "from_meta_json", "load", "names", "sequence", "summary"]
 
 
 def names() -> list[str]:

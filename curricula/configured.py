@@ -1,18 +1,25 @@
-"""A curriculum whose axes are plain arguments, so that a command line can set them."""
+"""Curricula whose axes are plain arguments, so that a command line can set them.
+
+Where blocks have equally many frames, a multiple of 2,048, and at most `MOST_TASKS` tasks, evaluations come eight times
+in a block, so that the speed of learning is seen.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from os import PathLike
 from typing import Any
 
-from ctgraph_rl.checks import are_ints, as_tuple, at_least_one, is_int, one_of, require, takes_its_kinds
+from ctgraph_rl.checks import ReadOnlyValues, are_ints, as_tuple, at_least_one, is_int, one_of, require, takes_its_kinds
 from ctgraph_rl.core.rewards import REWARD_FNS
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import OneHot
+from ctgraph_rl.tasks.observations import Observations
 from ctgraph_rl.tasks.paper_json import shown_ids
-from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift, Switch
+from ctgraph_rl.tasks.protocol import Evaluation
+from ctgraph_rl.tasks.reference import read_task
+from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift
 from ctgraph_rl.tasks.task import Task
 from curricula import axes
 from curricula.order import Tasks
@@ -26,6 +33,18 @@ SWITCHES: dict[str, Callable[[int], Any]] = {
     "drift": Drift,
 }
 IMAGE_SIZE = 12
+
+EVALUATIONS = 8
+"""In a block, the last one at its end."""
+
+ROWS = 256
+"""Environments that an evaluation within a block must fit; most agents have as many or a divisor."""
+
+MOST_TASKS = 20
+"""Of a curriculum with evaluations within blocks, as each evaluates all tasks."""
+
+TRIALS = 50
+"""Rows of an evaluation of a task whose goal changes."""
 
 
 @takes_its_kinds
@@ -59,6 +78,7 @@ def from_axes(
     step_reward: float = 0.0,
     reward_std: float = 0.0,
     reward_fn: str = "needle",
+    goal_change: int | Sequence[int] | None = None,
 ) -> Curriculum:
     """Any combination of axes; the paper's Table 3 has the names in brackets.
 
@@ -101,126 +121,176 @@ def from_axes(
         reward_std: standard deviation of the noise on the reward of end states [std_r].
         reward_fn: what end states pay: ``needle``, only the goal; ``gradient``, the nearer the goal the
             more; ``reference_linear``, as the authors' implementation [g].
+        goal_change: episodes after which each row draws another goal, a number or the fewest and the most, for agents
+            that adapt within a row's life; all tasks then share a block. None: goals stay.
 
     Raises:
         ValueError: for values out of range; lists the choices.
     """
+    plain_images = (image_seeds, image_size) == (1, IMAGE_SIZE)
     require(
-        *one_of(ORDERS, order=order),
-        *at_least_one(num_goals=num_goals, repeats=repeats),
-        (is_int(seed, 0), f"seed must be an integer >= 0, got {seed!r}"),
         *one_of(REWARD_FNS, reward_fn=reward_fn),
-        (
-            not one_hot or (image_seeds, image_size) == (1, IMAGE_SIZE),
-            "one_hot has no image_seeds and no image_size: leave them out",
-        ),
+        (is_int(seed, 0), f"seed must be an integer >= 0, got {seed!r}"),
+        (not one_hot or plain_images, "one_hot has no image_seeds and no image_size: leave them out"),
         (is_int(image_size, 4) and image_size % 4 == 0, f"image_size must be a multiple of 4, got {image_size!r}"),
     )
-    observed = partial(
-        _observed,
-        unique_decisions=unique_decisions,
-        unique_waits=unique_waits,
-        decision_ids=decision_ids,
-        wait_ids=wait_ids,
-        num_images=num_images,
-        image_size=image_size,
-    )
-    rewarded = partial(
-        replace,
-        goal_reward=goal_reward,
-        fail_reward=fail_reward,
-        step_reward=step_reward,
-        reward_std=reward_std,
-        reward_fn=REWARD_FNS[reward_fn](),
-    )
+    task = configured(configuration)
+    kind = KINDS[configuration]
+    depths = _several(depth, task.graph.depth)
+    probs = _several(wait_prob, task.graph.wait_prob)
     seeds = _several(image_seeds)
+    whole = bool(depths) and are_ints(depths, 1)
+    require((whole, f"depth must be an integer >= 1 or a list of them, got {depth!r}"))
     if random_graphs is None:
-        task, depths = _deepest(configuration, branching_factor, depth)
-        task = observed(task)
-        _check_goals(goals, depths)
-        if goals == "nested":
-            (task,) = axes.random_goals(task, 1, seed)
-        by_seed = _by_seed(task, depths, wait_prob, seeds, lambda graph: _with_goals(graph, goals, num_goals, seed))
-        tasks = _ordered(by_seed, order, seed)
+        b = task.graph.branching_factor if branching_factor is None else branching_factor
+        graph = replace(task.graph, branching_factor=b, depth=max(depths))
+        graphs = axes.as_tasks(axes.reshaped(task, graph, kind, (1,) * graph.depth))
     else:
         drawn = f"random_graphs draws goals and order: leave both out, got goals={goals!r} and order={order!r}"
         require(((goals, order) == ("all", "product"), drawn))
-        shape = (branching_factor, depth, wait_prob)
-        tasks = tuple(map(observed, _drawn(configuration, shape, random_graphs, seed, image_seeds=seeds)))
-    tasks = tuple(map(rewarded, tasks))
+        factors = _several(branching_factor, task.graph.branching_factor)
+        graphs = axes.random_tasks(random_graphs, seed, factors, depths, probs, kinds=(kind,), image_seeds=seeds)
+    ids = {
+        "unique_decisions": unique_decisions,
+        "unique_waits": unique_waits,
+        "decision_ids": decision_ids,
+        "wait_ids": wait_ids,
+    }
+    changed = []
+    for each in graphs:
+        shown = _shown(each, ids)
+        count = shown.last_id + 1 if num_images is None else num_images
+        made = replace(
+            each,
+            observations=replace(shown, read_noise=read_noise, read_rotation=read_rotation),
+            images=replace(each.images, num_images=count, size=image_size),  # type: ignore[type-var]
+            reward_fn=REWARD_FNS[reward_fn](),
+            goal_reward=goal_reward,
+            fail_reward=fail_reward,
+            step_reward=step_reward,
+            reward_std=reward_std,
+        )
+        changed.append(made)
+    tasks: Tasks = tuple(changed)
+    if random_graphs is None:
+        deepest = axes.random_goals(tasks, 1, seed) if goals == "nested" else tasks
+        by_seed = []
+        for shown_task in axes.image_seeds(deepest, seeds):
+            by_seed.append(axes.growing_depth(axes.wait_probs(shown_task, probs), depths))
+        tasks = _in_order(by_seed, goals, num_goals, order, seed=seed)
     if one_hot:
         tasks = axes.image_sets(tasks, [OneHot(tasks[0].images.num_images)])
-    tasks = axes.cycle(axes.read_variation(tasks, read_noise, read_rotation), repeats)
-    changes = _switch(switch, switch_episodes)
-    return axes.sequence(name, [tasks] if changes else tasks, num_frames, switch=changes)
-
-
-def _drawn(
-    configuration: str, shape: tuple[Any, Any, Any], count: int, seed: int, image_seeds: tuple[int, ...]
-) -> Tasks:
-    """Random tasks with some branching factors, depths and wait probabilities; None: as configured."""
-    graph = configured(configuration).graph
-    branching_factor, depth, wait_prob = shape
-    return axes.random_tasks(
-        count,
-        seed,
-        branching_factors=_several(branching_factor, graph.branching_factor),
-        depths=_several(depth, graph.depth),
-        wait_probs=_several(wait_prob, graph.wait_prob),
-        kinds=(KINDS[configuration],),
-        image_seeds=image_seeds,
+    return _curriculum(
+        name,
+        tasks,
+        num_frames,
+        repeats=repeats,
+        switch=switch,
+        switch_episodes=switch_episodes,
+        goal_change=goal_change,
     )
 
 
-def _deepest(
-    configuration: str, branching_factor: Any, depth: int | Sequence[int] | None
-) -> tuple[Task, tuple[Any, ...]]:
-    """The configured task on its deepest graph, and all depths."""
-    task = configured(configuration)
-    depths = _several(depth, task.graph.depth)
-    whole = bool(depths) and are_ints(depths, 1)
-    require((whole, f"depth must be an integer >= 1 or a list of them, got {depth!r}"))
-    b = task.graph.branching_factor if branching_factor is None else branching_factor
-    graph = replace(task.graph, branching_factor=b, depth=max(depths))
-    return axes.reshaped(task, graph, KINDS[configuration], (1,) * graph.depth), depths
+@takes_its_kinds
+def from_graph(
+    config: str | PathLike[str] | ReadOnlyValues | None = None,
+    wait_prob: float | Sequence[float] | None = None,
+    goals: str | Sequence[Sequence[int]] = "all",
+    num_goals: int = 4,
+    order: str = "product",
+    repeats: int = 1,
+    seed: int = 0,
+    num_frames: int | Sequence[int] = 204_800,
+    switch: str | None = None,
+    switch_episodes: int = 100,
+    name: str = "graph",
+    goal_change: int | Sequence[int] | None = None,
+) -> Curriculum:
+    """Goals of the graph of a JSON file, with the parameters of the paper's Table 3 or of the authors' implementation.
 
+    Args:
+        config: the file, such as graph.json, which says all but the goal; or its content.
+        wait_prob: another p, or several; None: as in the file.
+        goals: ``all``; ``random``, ``num_goals`` of them; ``nested``, one random goal; or a list of goals such as
+            [[1,2],[2,1]].
+        num_goals: how many random goals.
+        order: ``product``, the goals of each wait probability; ``interleave``, wait probabilities take turns;
+            ``shuffle``, by ``seed``; or ``reverse``.
+        repeats: how often the whole sequence comes.
+        seed: draws random goals and the shuffled order.
+        num_frames: frames per block, or a list with those of each.
+        switch: None: a block for each task; else all tasks in one block, between which each row changes: in turns,
+            ``by_episode``; ``at_random``; or by ``drift`` from each task to the next.
+        switch_episodes: episodes between changes, in turns, in the mean, or of a drift.
+        name: of the curriculum, in logs and tables.
+        goal_change: episodes after which each row draws another goal, a number or the fewest and the most; all tasks
+            then share a block. None: as in the file.
 
-def _observed(task: Task, num_images: int | None, image_size: int, **changes: Any) -> Task:
-    """The task with other ids of its states, and images for them; None: as configured."""
-    shown = task.observations
-    given = {name: value for name, value in changes.items() if value is not None}
-    if given:
-        draws = not shown.unique_waits and shown.wait_ids[0] < shown.wait_ids[1]
-        kept = {"wait_ids": shown.wait_ids} if draws and not given.get("unique_waits") else {}
-        found = {"unique_decisions": shown.unique_decisions, "unique_waits": shown.unique_waits, **kept, **given}
-        shown = shown_ids(task.graph, found)
-    count = shown.last_id + 1 if num_images is None else num_images
-    images = replace(task.images, num_images=count, size=image_size)  # type: ignore[type-var]
-    return replace(task, observations=shown, images=images)
-
-
-def _by_seed(
-    task: Task, depths: tuple[int, ...], wait_prob: Any, seeds: tuple[int, ...], with_goals: Callable[[Task], Tasks]
-) -> list[list[Tasks]]:
-    """For each image seed the tasks on each graph."""
+    Raises:
+        ValueError: for no file, one that is not of this form, and values out of range; lists the choices.
+    """
+    require(
+        (config is not None, "config must be a JSON file of a graph's parameters, such as graph.json, got None"),
+        (is_int(seed, 0), f"seed must be an integer >= 0, got {seed!r}"),
+    )
+    depth = read_task(config, ())["graph"].depth  # type: ignore[arg-type]
+    task = Task.from_json(config, (1,) * depth)  # type: ignore[arg-type]
     probs = _several(wait_prob, task.graph.wait_prob)
-    found = []
-    for shown in axes.image_seeds(task, seeds):
-        graphs = axes.growing_depth(axes.wait_probs(shown, probs), depths)
-        found.append([with_goals(graph) for graph in graphs])
-    return found
+    graphs = axes.wait_probs(axes.random_goals(task, 1, seed) if goals == "nested" else task, probs)
+    tasks = _in_order([graphs], goals, num_goals, order, seed=seed)
+    return _curriculum(
+        name,
+        tasks,
+        num_frames,
+        repeats=repeats,
+        switch=switch,
+        switch_episodes=switch_episodes,
+        goal_change=goal_change,
+    )
 
 
-def _check_goals(goals: object, depths: tuple[int, ...]) -> None:
+def _several(value: object, usual: object = None) -> tuple[Any, ...]:
+    """Return a value or several of them as a tuple; the usual one for None."""
+    listed = as_tuple(usual if value is None else value)
+    return listed if isinstance(listed, tuple) else (listed,)
+
+
+def _shown(task: Task, ids: ReadOnlyValues) -> Observations:
+    """Return a task's observations with other ids of its states; None: as they are."""
+    shown = task.observations
+    given = {name: value for name, value in ids.items() if value is not None}
+    if not given:
+        return shown
+    draws = not shown.unique_waits and shown.wait_ids[0] < shown.wait_ids[1]
+    kept = {"wait_ids": shown.wait_ids} if draws and not given.get("unique_waits") else {}
+    found = {"unique_decisions": shown.unique_decisions, "unique_waits": shown.unique_waits, **kept, **given}
+    return shown_ids(task.graph, found)
+
+
+def _in_order(
+    by_seed: Sequence[Tasks], goals: str | Sequence[Sequence[int]], num_goals: int, order: str, seed: int
+) -> Tasks:
+    """Return the graphs of each image seed with their goals, in one order."""
+    require(*one_of(ORDERS, order=order), *at_least_one(num_goals=num_goals))
+    depths = {graph.graph.depth for graph in by_seed[0]}
     if isinstance(goals, str):
         require((goals in GOALS, f"goals must be one of {', '.join(GOALS)}, or a list of goals, got {goals!r}"))
-        return
-    listed = as_tuple(goals)
-    is_list = isinstance(listed, tuple) and all(isinstance(as_tuple(goal), tuple) for goal in listed)
-    require((is_list, f"goals must be one of {', '.join(GOALS)}, or a list such as [[1, 2]], got {goals!r}"))
-    lengths = {len(goal) for goal in listed}  # type: ignore[attr-defined]
-    rule = f"goals must have as many decisions as the depths, {sorted(set(depths))}, and some for each; got {goals!r}"
-    require((lengths == set(depths), rule))
+    else:
+        listed = _several(goals)
+        is_list = all(isinstance(as_tuple(goal), tuple) for goal in listed)
+        require((is_list, f"goals must be one of {', '.join(GOALS)}, or a list such as [[1, 2]], got {goals!r}"))
+        rule = f"goals must have as many decisions as the depths, {sorted(depths)}, and some for each; got {goals!r}"
+        require(({len(goal) for goal in listed} == depths, rule))
+    with_goals = []
+    for graphs in by_seed:
+        with_goals.append([_with_goals(graph, goals, num_goals, seed) for graph in graphs])
+    sequences = [axes.concatenate(*graphs) for graphs in with_goals]
+    if order == "interleave":
+        return axes.interleave(*(sequences if len(sequences) > 1 else with_goals[0]))
+    tasks = axes.concatenate(*sequences)
+    if order == "shuffle":
+        return axes.shuffle(tasks, seed)
+    return axes.reverse(tasks) if order == "reverse" else tasks
 
 
 def _with_goals(task: Task, goals: str | Sequence[Sequence[int]], num_goals: int, seed: int) -> Tasks:
@@ -231,26 +301,35 @@ def _with_goals(task: Task, goals: str | Sequence[Sequence[int]], num_goals: int
     return axes.given_goals(task, [goal for goal in goals if len(goal) == task.graph.depth])
 
 
-def _ordered(by_seed: list[list[Tasks]], order: str, seed: int) -> Tasks:
-    sequences = [axes.concatenate(*graphs) for graphs in by_seed]
-    if order == "interleave":
-        return axes.interleave(*(sequences if len(sequences) > 1 else by_seed[0]))
-    tasks = axes.concatenate(*sequences)
-    if order == "shuffle":
-        return axes.shuffle(tasks, seed)
-    return axes.reverse(tasks) if order == "reverse" else tasks
-
-
-def _switch(switch: str | None, episodes: int) -> Switch | None:
+def _curriculum(
+    name: str,
+    tasks: Tasks,
+    num_frames: int | Sequence[int],
+    repeats: int,
+    switch: str | None,
+    switch_episodes: int,
+    goal_change: int | Sequence[int] | None,
+) -> Curriculum:
+    """Return tasks as blocks, or in one block where rows change between them or draw their goals."""
     known = switch is None or switch in SWITCHES
     require(
+        *at_least_one(repeats=repeats),
         (known, f"switch must be one of {', '.join(SWITCHES)}, or null, got {switch!r}"),
-        (is_int(episodes, 1), f"switch_episodes must be an integer >= 1, got {episodes!r}"),
+        (is_int(switch_episodes, 1), f"switch_episodes must be an integer >= 1, got {switch_episodes!r}"),
     )
-    return None if switch is None else SWITCHES[switch](episodes)
-
-
-def _several(value: object, usual: object = None) -> tuple[Any, ...]:
-    """A value or several of them as a tuple; the usual one for None."""
-    listed = as_tuple(usual if value is None else value)
-    return listed if isinstance(listed, tuple) else (listed,)
+    changes = None if switch is None else SWITCHES[switch](switch_episodes)
+    if goal_change is not None:
+        lasts = _several(goal_change)
+        pair = (*lasts, *lasts) if len(lasts) == 1 else lasts
+        tasks = tuple(replace(task, goal_change=pair) for task in tasks)
+    every = 0
+    if is_int(num_frames) and len(set(tasks)) <= MOST_TASKS and num_frames % (EVALUATIONS * ROWS) == 0:
+        every = num_frames // EVALUATIONS
+    evaluation = Evaluation(every=every)
+    change = tasks[0].goal_change
+    if change is not None:
+        episodes = change[0]
+        evaluation = Evaluation(TRIALS * episodes, greedy=False, episodes_per_row=episodes, every=every)
+    tasks = axes.cycle(tasks, repeats)
+    together = changes is not None or change is not None
+    return axes.sequence(name, [tasks] if together else tasks, num_frames, evaluation=evaluation, switch=changes)

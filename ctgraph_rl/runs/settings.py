@@ -75,6 +75,7 @@ ADDED: dict[str, NamedValues] = {
         "step_reward": 0.0,
         "reward_std": 0.0,
         "reward_fn": "needle",
+        "goal_change": None,
     },
     "curricula.penn_a_swap": {"num_lives": None},
     "curricula.random_graphs": {"held_out": 0},

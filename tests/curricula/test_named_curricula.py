@@ -12,7 +12,7 @@ from pathlib import Path
 
 import hydra
 import pytest
-from helpers.conf_files import conf_file
+from helpers.conf_files import UNNAMED, conf_file
 from omegaconf import OmegaConf
 
 import curricula
@@ -98,13 +98,13 @@ def test_a_yaml_builds_the_curriculum_of_its_name():
         assert built.source, name
 
 
-def test_every_yaml_is_a_named_curriculum_or_the_one_of_free_axes():
+def test_every_yaml_is_a_named_curriculum_or_one_of_settings():
     files = {path.stem for path in FOLDER.glob("*.yaml")}
 
-    assert files == {*NAMES, *NEEDS, "axes"}
+    assert files == {*NAMES, *NEEDS, *UNNAMED}
 
 
-@pytest.mark.parametrize("name", [*NAMES, "axes"])
+@pytest.mark.parametrize("name", [*NAMES, *UNNAMED])
 def test_a_yaml_is_written_from_the_signature_and_the_docstring_of_its_function(name):
     written = (FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
 

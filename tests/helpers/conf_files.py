@@ -21,9 +21,13 @@ WORDS = {"`": "", "None": "null", "True": "true", "False": "false"}
 """What yaml writes for what Python writes."""
 
 
+UNNAMED = {"axes": "from_axes", "graph": "from_graph"}
+"""Files of curricula that are made of settings, with their functions."""
+
+
 def conf_file(name: str) -> str:
     """Return the yaml file of a curriculum: what it is, and each argument with its default and its meaning."""
-    target = "from_axes" if name == "axes" else name
+    target = UNNAMED.get(name, name)
     function = unwrap(getattr(curricula, target))
     text = getdoc(getattr(function, "func", function)) or ""
     for python, word in WORDS.items():
@@ -40,5 +44,5 @@ def conf_file(name: str) -> str:
 
 
 if __name__ == "__main__":
-    for each in (*curricula.names(), "axes"):
+    for each in (*curricula.names(), *UNNAMED):
         Path(conf_dir(), "curriculum", f"{each}.yaml").write_text(conf_file(each), encoding="utf-8")
