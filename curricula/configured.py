@@ -6,7 +6,7 @@ in a block, so that the speed of learning is seen.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
 from typing import Any
@@ -229,8 +229,9 @@ def from_graph(
     Raises:
         ValueError: for no file, one that is not of this form, and values out of range; lists the choices.
     """
+    is_file = isinstance(config, (str, PathLike, Mapping))
     require(
-        (config is not None, "config must be a JSON file of a graph's parameters, such as graph.json, got None"),
+        (is_file, f"config must be a JSON file of a graph's parameters, such as graph.json, got {config!r}"),
         (is_int(seed, 0), f"seed must be an integer >= 0, got {seed!r}"),
     )
     depth = read_task(config, ())["graph"].depth  # type: ignore[arg-type]
@@ -256,7 +257,7 @@ def _several(value: object, usual: object = None) -> tuple[Any, ...]:
 
 
 def _shown(task: Task, ids: ReadOnlyValues) -> Observations:
-    """Return a task's observations with other ids of its states; None: as they are."""
+    """Return a task's observations with other ids of its states; None: unchanged."""
     shown = task.observations
     given = {name: value for name, value in ids.items() if value is not None}
     if not given:
@@ -320,7 +321,10 @@ def _curriculum(
     changes = None if switch is None else SWITCHES[switch](switch_episodes)
     if goal_change is not None:
         lasts = _several(goal_change)
-        pair = (*lasts, *lasts) if len(lasts) == 1 else lasts
+        pair = lasts * 2 if len(lasts) == 1 else lasts
+        in_order = len(pair) == 2 and are_ints(pair, 1) and pair[0] <= pair[1]
+        rule = f"goal_change must be a number of episodes >= 1, or the fewest and the most, got {goal_change!r}"
+        require((in_order, rule))
         tasks = tuple(replace(task, goal_change=pair) for task in tasks)
     every = 0
     if is_int(num_frames) and len(set(tasks)) <= MOST_TASKS and num_frames % (EVALUATIONS * ROWS) == 0:

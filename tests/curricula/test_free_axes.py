@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from itertools import product
 
 import hydra
 import pytest
 
 import curricula
-from ctgraph_rl import Block
+from ctgraph_rl import Block, Evaluation, Task
 from ctgraph_rl.tasks.configurations import ct_graph, ct_su_b1
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift
-from curricula.axes import (
-    all_goals,
-)
+from curricula import axes
 
-A, B, C, D = all_goals(ct_su_b1())
+A, B, C, D = axes.all_goals(ct_su_b1())
 
 
 def goals(tasks) -> list[str]:
@@ -98,6 +98,79 @@ def test_a_switch_makes_one_block_of_all_tasks(switch, expected):
     built = curricula.from_axes("su_b1", switch=switch, switch_episodes=50, num_frames=512)
 
     assert built.blocks == (Block((A, B, C, D), 512, expected),)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "every"),
+    [
+        ({}, 25_600),
+        ({"num_frames": 2048}, 256),
+        ({"num_frames": 1000}, 0),
+        ({"num_frames": [2048, 4096, 2048, 2048]}, 0),
+        ({"branching_factor": 4, "configuration": "fo_b1"}, 25_600),
+        ({"branching_factor": 5, "configuration": "fo_b1"}, 0),
+    ],
+)
+def test_free_axes_evaluate_eight_times_in_a_block_where_these_fit_rows_and_tasks_are_at_most_20(arguments, every):
+    assert curricula.from_axes(**arguments).evaluation == Evaluation(every=every)
+
+
+@pytest.mark.parametrize(("goal_change", "lasts"), [(8, (8, 8)), ([4, 6], (4, 6))])
+def test_goals_that_change_begin_in_one_block_and_are_evaluated_for_all_the_episodes_that_they_last(goal_change, lasts):
+    built = curricula.from_axes("fo_b1", goal_change=goal_change)
+
+    [block] = built.blocks
+    assert [(task.goal, task.goal_change) for task in block.tasks] == [(task.goal, lasts) for task in (A, B, C, D)]
+    measured = Evaluation(50 * lasts[0], greedy=False, episodes_per_row=lasts[0], every=25_600)
+    assert built.evaluation == measured
+    built.evaluation.check(built.tasks)
+
+
+GRAPH = {"graph_shape": {"d": 3, "b": 2, "p": 0.5}, "reward": {"fail_r": -0.1}, "image_set": {"seed": 3}}
+
+
+def test_a_json_file_of_a_graph_is_a_curriculum_of_its_goals_on_the_command_line(compose, tmp_path):
+    file = tmp_path / "graph.json"
+    file.write_text(json.dumps(GRAPH))
+    cfg = compose("curriculum=graph", f"curriculum.config={file}", "curriculum.goals=[[1,1,2],[2,1,1]]")
+
+    built = hydra.utils.instantiate(cfg.curriculum)
+
+    assert built.tasks == (Task.from_json(GRAPH, (1, 1, 2)), Task.from_json(GRAPH, (2, 1, 1)))
+    assert built == curricula.from_graph(GRAPH, goals=[(1, 1, 2), (2, 1, 1)])
+
+
+def test_settings_of_a_graph_change_goals_and_waits_and_nothing_else():
+    nested = curricula.from_graph(GRAPH, wait_prob=[0, 0.5], goals="nested", seed=2)
+    alike = [replace(task, graph=replace(task.graph, wait_prob=0.5)) for task in nested.tasks]
+    changing = curricula.from_graph(GRAPH, goal_change=8)
+
+    assert [task.graph.wait_prob for task in nested.tasks] == [0, 0.5]
+    assert set(alike) == {Task.from_json(GRAPH, nested.tasks[0].goal)}
+    assert len(changing.blocks[0].tasks) == 8
+    assert curricula.from_graph(GRAPH, goals="random", num_goals=3).tasks == axes.random_goals(
+        Task.from_json(GRAPH, (1, 1, 1)), 3, 0
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({}, "config must be a JSON file of a graph's parameters, such as graph.json, got None"),
+        ({"config": 3}, "config must be a JSON file of a graph's parameters, such as graph.json, got 3"),
+        ({"config": "none.json"}, "none.json must be a JSON file that can be read"),
+        ({"config": {"graph_shape": {"d": 2, "b": 2, "q": 1}}}, "Table 3 has no graph_shape.q"),
+        ({"config": GRAPH, "goals": [[1, 2]]}, r"goals must have as many decisions as the depths, \[3\]"),
+        ({"config": GRAPH, "order": "random"}, "order must be one of product, interleave, shuffle, reverse, got"),
+        ({"config": GRAPH, "wait_prob": 1}, r"wait_prob must be in \[0, 1\), got 1"),
+        ({"config": GRAPH, "goal_change": 0}, "goal_change must be a number of episodes >= 1, or the fewest and the"),
+        ({"config": GRAPH, "goal_change": [3, 2]}, r"and the most, got \[3, 2\]"),
+        ({"config": GRAPH, "goal_change": "x"}, "goal_change must be an integer or a list or null, got 'x'"),
+    ],
+)
+def test_a_graph_that_makes_no_curriculum_is_refused_with_the_rule(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        curricula.from_graph(**arguments)
 
 
 @pytest.mark.parametrize(

@@ -60,7 +60,7 @@ QUICK = {"agents", "curricula", "methods"}
 """Commands that run here; others are parsed: they need runs, a terminal, or are run by the tests of pictures."""
 
 BLOCK = re.compile(r"^( *)```(\w*)\n(.*?)^ *```$", re.MULTILINE | re.DOTALL)
-FILE = re.compile(r"^[^\n]*?`([\w/]+\.(?:py|yaml))`[^\n]*:\n+\Z", re.MULTILINE)
+FILE = re.compile(r"^[^\n]*?`([\w/]+\.(?:py|yaml|json))`[^\n]*:\n+\Z", re.MULTILINE)
 
 
 class Block(NamedTuple):
