@@ -5,47 +5,36 @@ Mnih et al. 2016 (arXiv 1602.01783), in its synchronous form.
 
 from __future__ import annotations
 
-from typing import Any
-
-from torchrl.data import Composite, TensorSpec
+from dataclasses import dataclass
 
 from baselines.parts.networks import Data, TensorsByName
-from baselines.parts.policy_gradient import PolicyGradient, critic_loss, entropy_loss
+from baselines.parts.policy_gradient import PolicyGradient, PolicyGradientSettings, critic_loss, entropy_loss
 from ctgraph_rl.checks import not_negative, require
 
 
+@dataclass(frozen=True, kw_only=True)
+class A2CSettings(PolicyGradientSettings):
+    """The settings of `A2C`; ``gae_lambda`` 1 gives the paper's returns of up to ``num_steps`` steps."""
+
+    entropy_coeff: float  # weight of the entropy bonus
+    critic_coeff: float  # weight of the critic's loss, a mean squared error
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(*not_negative(entropy_coeff=self.entropy_coeff, critic_coeff=self.critic_coeff))
+
+
 class A2C(PolicyGradient):
-    """A2C for tasks that need no memory.
+    """A2C for tasks that need no memory; its settings are `A2CSettings`."""
 
-    Args:
-        observation_spec: the environment's ``observation_spec_unbatched``.
-        action_spec: the environment's ``action_spec_unbatched``.
-        entropy_coeff: weight of the entropy bonus.
-        critic_coeff: weight of the critic's loss, a mean squared error.
-        settings: the arguments of `PolicyGradient`; a batch is one gradient step, and ``gae_lambda`` 1 gives the
-            paper's returns of up to ``num_steps`` steps.
-    """
-
+    Settings = A2CSettings
     solves = "fully observable tasks (CT-FO)"
-
-    def __init__(
-        self,
-        observation_spec: Composite,
-        action_spec: TensorSpec,
-        entropy_coeff: float,
-        critic_coeff: float,
-        **settings: Any,
-    ) -> None:
-        require(*not_negative(entropy_coeff=entropy_coeff, critic_coeff=critic_coeff))
-        super().__init__(observation_spec, action_spec, **settings)
-        self.entropy_coeff = entropy_coeff
-        self.critic_coeff = critic_coeff
 
     def loss(self, batch: Data) -> TensorsByName:
         """Compute the losses of policy, critic and entropy, as TorchRL's `A2CLoss` does."""
         log_probs, taken, values = self.evaluate_actions(batch)
         return {
             "loss_objective": -(taken * batch["advantage"]).mean(),
-            "loss_critic": critic_loss(values, batch, self.critic_coeff),
-            **entropy_loss(log_probs, self.entropy_coeff),
+            "loss_critic": critic_loss(values, batch, self.settings.critic_coeff),
+            **entropy_loss(log_probs, self.settings.entropy_coeff),
         }

@@ -40,8 +40,8 @@ from torchrl.data import Composite, TensorSpec
 
 from baselines.cells.cell import linear_layer
 from baselines.parts.distinct import distinct
-from baselines.parts.learner import require_finite
 from baselines.parts.networks import Data, TensorsByName, guided, highest, is_greedy, num_actions_of, require_weights
+from baselines.update.measured import require_finite
 from baselines.update.update import minimise
 from ctgraph_rl.checks import NamedValues, TakesNumbers, at_least_one, fraction, positive, require, require_memory
 from ctgraph_rl.learn.collect import UNSTORED

@@ -6,6 +6,7 @@ gets a bonus of coeff / sqrt(times that its hash was seen), in addition to the e
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -14,7 +15,7 @@ from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 
 from baselines.parts.networks import highest
-from baselines.ppo import PPO
+from baselines.ppo import PPO, PPOSettings
 from ctgraph_rl.checks import is_int, not_negative, require
 
 
@@ -46,33 +47,29 @@ class SimHashCounts(nn.Module):
         return self.counts[codes]
 
 
+@dataclass(frozen=True, kw_only=True)
+class PPOCountSettings(PPOSettings):
+    """The settings of `PPOCount`."""
+
+    bonus_coeff: float  # bonus for an observation that was never seen before
+    num_hash_bits: int  # bits of the hash, at most 24; more bits tell more observations apart
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        bits = f"num_hash_bits must be an integer in 1..24, got {self.num_hash_bits!r}"
+        require((is_int(self.num_hash_bits, 1, 24), bits), *not_negative(bonus_coeff=self.bonus_coeff))
+
+
 class PPOCount(PPO):
-    """PPO with a count-based exploration bonus.
+    """PPO with a count-based exploration bonus; its settings are `PPOCountSettings`."""
 
-    Args:
-        observation_spec: the environment's ``observation_spec_unbatched``.
-        action_spec: the environment's ``action_spec_unbatched``.
-        bonus_coeff: bonus for an observation that was never seen before.
-        num_hash_bits: bits of the hash, at most 24; more bits tell more observations apart.
-        settings: the arguments of `PPO`.
-    """
-
+    Settings = PPOCountSettings
     solves = "fully observable tasks (CT-FO) whose goal random actions almost never reach"
 
-    def __init__(
-        self,
-        observation_spec: Composite,
-        action_spec: TensorSpec,
-        bonus_coeff: float,
-        num_hash_bits: int,
-        **settings: Any,
-    ) -> None:
-        bits = (is_int(num_hash_bits, 1, 24), f"num_hash_bits must be an integer in 1..24, got {num_hash_bits!r}")
-        require(bits, *not_negative(bonus_coeff=bonus_coeff))
+    def __init__(self, observation_spec: Composite, action_spec: TensorSpec, **settings: Any) -> None:
         super().__init__(observation_spec, action_spec, **settings)
         spec = observation_spec["observation"]
-        self.bonus_coeff = bonus_coeff
-        self.seen = SimHashCounts(spec.shape.numel(), highest(spec), num_hash_bits)
+        self.seen = SimHashCounts(spec.shape.numel(), highest(spec), self.settings.num_hash_bits)
 
     def start_task(self, task: int | None = None) -> None:
         """Reset all counts."""
@@ -84,4 +81,4 @@ class PPOCount(PPO):
 
     def bonus(self, observation: Tensor) -> Tensor:
         """Count observations, and return the bonus for each, float32 [n]."""
-        return self.bonus_coeff * self.seen(observation).float().rsqrt()
+        return self.settings.bonus_coeff * self.seen(observation).float().rsqrt()

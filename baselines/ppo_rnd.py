@@ -21,6 +21,7 @@ the random network, 16 for each pixel and 4 for each environment.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -30,10 +31,10 @@ from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 
 from baselines.cells.cell import linear_layer
-from baselines.parts.learner import reset_layer
 from baselines.parts.networks import Data, Items, TensorsByName, critic, encoder, highest
 from baselines.parts.policy_gradient import Seeds, generalized_advantages
-from baselines.ppo import PPO
+from baselines.ppo import PPO, PPOSettings
+from baselines.update.trained import reset_layer
 from baselines.update.update import make_optimiser, minimise
 from ctgraph_rl.checks import NamedValues, at_least_one, fraction, not_negative, positive, require, require_memory
 
@@ -141,61 +142,49 @@ class Novelty(nn.Module):
         return observations.reshape(-1, self.num_inputs).float() * self.scale
 
 
+@dataclass(frozen=True, kw_only=True)
+class PPORNDSettings(PPOSettings):
+    """The settings of `PPORND`."""
+
+    bonus_coeff: float  # weight of the advantages of the bonus
+    bonus_gamma: float  # discount factor of the bonus
+    num_features: int  # outputs of the random network and of its predictor, whose hidden layer is hidden_size wide
+    bonus_learning_rate: float  # of Adam for the predictor and the critic of the bonus
+    predictor_share: float  # share of each minibatch that the predictor learns from, at least one frame
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(
+            *not_negative(bonus_coeff=self.bonus_coeff),
+            *positive(bonus_gamma=self.bonus_gamma, bonus_learning_rate=self.bonus_learning_rate),
+            *positive(predictor_share=self.predictor_share),
+            *fraction(bonus_gamma=self.bonus_gamma, predictor_share=self.predictor_share),
+            *at_least_one(num_features=self.num_features),
+        )
+
+
 class PPORND(PPO):
-    """PPO with random network distillation.
+    """PPO with random network distillation; its settings are `PPORNDSettings`."""
 
-    Args:
-        observation_spec: the environment's ``observation_spec_unbatched``.
-        action_spec: the environment's ``action_spec_unbatched``.
-        bonus_coeff: weight of the advantages of the bonus.
-        bonus_gamma: discount factor of the bonus.
-        num_features: outputs of the random network and of its predictor, whose hidden layer is ``hidden_size`` wide.
-        bonus_learning_rate: of Adam for the predictor and the critic of the bonus.
-        predictor_share: share of each minibatch that the predictor learns from, at least one frame.
-        settings: the arguments of `PPO`.
-    """
-
+    Settings = PPORNDSettings
     solves = "fully observable tasks (CT-FO) whose goal random actions almost never reach"
 
-    def __init__(
-        self,
-        observation_spec: Composite,
-        action_spec: TensorSpec,
-        bonus_coeff: float,
-        bonus_gamma: float,
-        num_features: int,
-        bonus_learning_rate: float,
-        predictor_share: float,
-        **settings: Any,
-    ) -> None:
-        require(
-            *not_negative(bonus_coeff=bonus_coeff),
-            *positive(
-                bonus_gamma=bonus_gamma, bonus_learning_rate=bonus_learning_rate, predictor_share=predictor_share
-            ),
-            *fraction(bonus_gamma=bonus_gamma, predictor_share=predictor_share),
-            *at_least_one(num_features=num_features),
-        )
+    def __init__(self, observation_spec: Composite, action_spec: TensorSpec, **settings: Any) -> None:
         super().__init__(observation_spec, action_spec, **settings)
+        given = self.settings
         spec = observation_spec["observation"]
-        width = settings["hidden_size"]
-        size = width * (spec.shape.numel() + num_features)
-        require_memory(f"weights of num_features={num_features}", 20 * size, "or smaller layers")
-        self.bonus_coeff = bonus_coeff
-        self.bonus_gamma = bonus_gamma
-        self.predictor_share = predictor_share
-        high = highest(spec)
-        shape = (spec.shape.numel(), width, num_features)
-        self.novelty = Novelty(*shape, high=high, num_envs=self.num_envs, gamma=bonus_gamma)
-        self.bonus_critic = TensorDictSequential(
-            encoder(observation_spec, width, settings["num_layers"], kind=self.encoder), critic("features", width)
-        )
-        self.bonus_learning_rate = bonus_learning_rate
+        width = given.hidden_size
+        size = width * (spec.shape.numel() + given.num_features)
+        require_memory(f"weights of num_features={given.num_features}", 20 * size, "or smaller layers")
+        shape = (spec.shape.numel(), width, given.num_features)
+        self.novelty = Novelty(*shape, high=highest(spec), num_envs=self.num_envs, gamma=given.bonus_gamma)
+        features = encoder(observation_spec, width, given.num_layers, kind=given.encoder)
+        self.bonus_critic = TensorDictSequential(features, critic("features", width))
         self._make_bonus_optimiser()
 
     def _make_bonus_optimiser(self) -> None:
         learned = [*self.novelty.predictor.parameters(), *self.bonus_critic.parameters()]
-        self.bonus_optimiser = make_optimiser("adam", learned, self.bonus_learning_rate)
+        self.bonus_optimiser = make_optimiser("adam", learned, self.settings.bonus_learning_rate)
 
     def start_task(self, task: int | None = None) -> None:
         """Draw a new predictor and a new critic of the bonus, and reset their optimiser and all statistics."""
@@ -213,7 +202,7 @@ class PPORND(PPO):
         for minibatch in super().minibatches(batch):
             observations = minibatch.pop("next_observation")
             target = minibatch.pop("bonus_target")
-            used = max(1, round(self.predictor_share * len(observations)))  # the frames are shuffled
+            used = max(1, round(self.settings.predictor_share * len(observations)))  # the frames are shuffled
             error = (self.bonus_values(minibatch) - target).square().mean()
             minimise(self.bonus_optimiser, error + self.novelty(observations[:used]).mean())
             yield minibatch
@@ -228,7 +217,7 @@ class PPORND(PPO):
     def advantages(self, batch: TensorDictBase, *given: Tensor) -> tuple[Tensor, Tensor]:
         """Compute the advantages, the sum of the reward's and the weighted bonus's, and the critic's targets."""
         advantage, target = super().advantages(batch, *given)
-        return advantage + self.bonus_coeff * batch["bonus_advantage"], target
+        return advantage + self.settings.bonus_coeff * batch["bonus_advantage"], target
 
     def bonus_advantages(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Compute the bonus's advantages and the targets of its critic, [num_envs, num_steps, 1] each.
@@ -241,7 +230,7 @@ class PPORND(PPO):
         following = torch.cat([values[:, 1:], self.bonus_values(last)], dim=1)
         never = torch.zeros_like(batch["next", "done"])
         given = (values, following, bonus, never, never)
-        return generalized_advantages(self.bonus_gamma, self.gae_lambda, *given)
+        return generalized_advantages(self.settings.bonus_gamma, self.settings.gae_lambda, *given)
 
     def get_extra_state(self) -> NamedValues:
         """Return the states of both optimisers."""

@@ -7,6 +7,7 @@ whole trial, so an early episode may be spent on search.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -15,10 +16,11 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.nn.functional import one_hot
 from torchrl.data import Composite, TensorSpec
+from typing_extensions import override
 
-from baselines.parts.networks import GROUP, Data, Items, RecurrentModule, TensorsByName, num_actions_of, recurrent
+from baselines.parts.networks import GROUP, Data, Items, RecurrentModule, TensorsByName, num_actions_of
 from baselines.parts.policy_gradient import Seeds
-from baselines.ppo import PPO
+from baselines.ppo import PPO, PPOSettings
 from ctgraph_rl.checks import at_least_one, require
 from ctgraph_rl.core.dynamics import OUTCOME_GOAL
 
@@ -74,48 +76,37 @@ class TrialTrunk(TensorDictModuleBase):
         return inputs | {"is_init": fresh, "previous": torch.where(fresh, 0.0, previous)}, episode
 
 
+@dataclass(frozen=True, kw_only=True)
+class RL2Settings(PPOSettings):
+    """The settings of `RL2`."""
+
+    trial_episodes: int  # episodes of a trial
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(*at_least_one(trial_episodes=self.trial_episodes))
+
+
 class RL2(PPO):
-    """PPO over trials of several episodes, over which the LSTM keeps its state.
+    """PPO over trials of several episodes, over which the LSTM keeps its state; its settings are `RL2Settings`."""
 
-    Args:
-        observation_spec: the environment's ``observation_spec_unbatched``.
-        action_spec: the environment's ``action_spec_unbatched``.
-        trial_episodes: episodes of a trial.
-        settings: the arguments of `PPO`.
-    """
-
+    Settings = RL2Settings
     memory = True
     solves = "tasks whose goal changes after a number of episodes: it searches for the goal, then returns to it"
 
-    def __init__(
-        self, observation_spec: Composite, action_spec: TensorSpec, trial_episodes: int, **settings: Any
-    ) -> None:
+    def __init__(self, observation_spec: Composite, action_spec: TensorSpec, **settings: Any) -> None:
         found = "outcome" in observation_spec.keys()  # noqa: SIM118, a Composite is no dict
-        fix = "take agent=lstm_ppo"
-        require(
-            *at_least_one(trial_episodes=trial_episodes),
-            (found, f"RL2 needs CT-graphs, whose episodes say whether they found the goal: {fix}"),
-        )
-        self.trial_episodes = trial_episodes
+        require((found, "RL2 needs CT-graphs, whose episodes say whether they found the goal: take agent=lstm_ppo"))
         super().__init__(observation_spec, action_spec, **settings)
+        self.trial_episodes = self.settings.trial_episodes
 
-    def make_trunk(
-        self, observation_spec: Composite, action_spec: TensorSpec, hidden_size: int, num_layers: int
-    ) -> TrialTrunk:
-        """Build a recurrent trunk that also reads the last action and reward."""
+    @override
+    def make_trunk(self, observation_spec: Composite, action_spec: TensorSpec, **extra: int) -> TrialTrunk:
         num_actions = num_actions_of(action_spec)
-        trunk = recurrent(
-            observation_spec,
-            hidden_size,
-            num_layers,
-            num_actions,
-            make_cell=self.cell,
-            kind=self.encoder,
-            previous=num_actions + 1,
-        )
+        trunk = super().make_trunk(observation_spec, action_spec, previous=num_actions + 1)
         message = "reads_action and reads_reward must be false, as RL2 reads its last action and reward itself"
         require((not trunk.own_keys, message))
-        return TrialTrunk(trunk, num_actions, self.trial_episodes)
+        return TrialTrunk(trunk, num_actions, self.settings.trial_episodes)
 
     def initial_state(self, num_envs: int) -> TensorDict:
         """Return the state before the first trial: zeros.

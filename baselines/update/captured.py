@@ -15,9 +15,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from baselines.methods.method import Method
-from baselines.parts.learner import Learner, finite_means, table_of
+from baselines.parts.learner import Learner
 from baselines.parts.networks import Data, Items, TensorsByName
 from baselines.parts.policy_gradient import PolicyGradient, Seeds
+from baselines.update.measured import finite_means, table_of
 from baselines.update.seeds import SeedGroup, has_stackable, learner_of, or_error, sampled, why_not_step
 from baselines.update.stack import Stack
 from baselines.update.update import update

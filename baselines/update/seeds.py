@@ -19,9 +19,10 @@ from torch.fx import GraphModule
 
 from baselines.methods.method import AgentWithMethod
 from baselines.parts.hooks import Hooks
-from baselines.parts.learner import Learner, table_of
+from baselines.parts.learner import Learner
 from baselines.parts.networks import Data, Items, TensorsByName
 from baselines.update.compiled import compiler_options
+from baselines.update.measured import table_of
 from baselines.update.stack import Stack
 from baselines.update.update import has_parts, update
 from ctgraph_rl.agent import Agent
@@ -38,7 +39,7 @@ def why_not_together(agent: Agent) -> str | None:
     """Return why agents like this one cannot act and learn as one batch; None if they can."""
     learner = learner_of(agent)
     name = type(learner).__name__
-    if getattr(learner, "deduplicate", False):
+    if getattr(getattr(learner, "settings", None), "deduplicate", False):
         return f"{name} with deduplicate=true cannot be vectorised over seeds"
     if not isinstance(learner, Learner) or not learner.stackable or learner.memory:
         return f"{name} cannot be vectorised over seeds"

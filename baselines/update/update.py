@@ -6,7 +6,7 @@ Optimisers are PyTorch's own Adam and RMSprop; their step is a function of tenso
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -15,11 +15,8 @@ from torch.optim.adam import adam
 from torch.optim.rmsprop import rmsprop
 
 from baselines.parts.networks import Data, TensorsByName
+from baselines.update.trained import Trained
 from ctgraph_rl.core.dynamics import beside
-
-if TYPE_CHECKING:
-    from baselines.parts.learner import Learner
-
 
 OPTIMISERS = ("adam", "rmsprop")
 
@@ -66,13 +63,13 @@ class UpdateState(NamedTuple):
     pass."""
 
     others: Mapping[str, Tensor] = {}
-    """What `Learner.other_weights` returns, of several seeds [seeds, ...] each."""
+    """What `Trained.other_weights` returns, of several seeds [seeds, ...] each."""
 
 
-Update = Callable[["Learner", UpdateState, Data], TensorsByName]
+Update = Callable[[Trained, UpdateState, Data], TensorsByName]
 
 
-def update(learner: Learner, state: UpdateState, batch: Data) -> TensorsByName:
+def update(learner: Trained, state: UpdateState, batch: Data) -> TensorsByName:
     """Minimise the sum of the losses of a batch by one step; return losses and gradient norm.
 
     It has no branch on data and depends only on its arguments. With several seeds these are minibatches [seeds, items,
@@ -90,14 +87,14 @@ def update(learner: Learner, state: UpdateState, batch: Data) -> TensorsByName:
     return {**{key: value.detach() for key, value in losses.items()}, "grad_norm": norm}
 
 
-def losses_of(learner: Learner, state: UpdateState, batch: Data) -> TensorsByName:
+def losses_of(learner: Trained, state: UpdateState, batch: Data) -> TensorsByName:
     """Compute the agent's losses and the method's penalties, of each seed where there are several."""
     if state.tensors is None:
         return learner.losses(batch, state.weights, state.others)
     return over_seeds(learner, _losses, state, batch, state.others)
 
 
-def over_seeds(learner: Learner, function: Callable[..., Any], state: UpdateState, *given: Any) -> Any:
+def over_seeds(learner: Trained, function: Callable[..., Any], state: UpdateState, *given: Any) -> Any:
     """Compute a function of a learner, its weights and further tensors for each seed."""
 
     def of_one(tensors: TensorsByName, *its: Any) -> Any:
@@ -106,7 +103,7 @@ def over_seeds(learner: Learner, function: Callable[..., Any], state: UpdateStat
     return vmap(of_one)(_seen(state), *given)
 
 
-def with_tensors(learner: Learner, state: UpdateState, function: Callable[..., Any], *given: Any) -> Any:
+def with_tensors(learner: Trained, state: UpdateState, function: Callable[..., Any], *given: Any) -> Any:
     """Compute a function of a learner that has the tensors of a state, those of all seeds at once, and its weights."""
     if state.tensors is None:
         return function(learner, state.weights, *given)
@@ -114,13 +111,13 @@ def with_tensors(learner: Learner, state: UpdateState, function: Callable[..., A
 
 
 def _with(
-    learner: Learner, tensors: TensorsByName, function: Callable[..., Any], state: UpdateState, *given: Any
+    learner: Trained, tensors: TensorsByName, function: Callable[..., Any], state: UpdateState, *given: Any
 ) -> Any:
     weights = [tensors[name] for name in state.names]
     return functional_call(learner, tensors, (function, weights, *given), tie_weights=False)
 
 
-def _losses(learner: Learner, weights: Sequence[Tensor], batch: Data, others: Data) -> TensorsByName:
+def _losses(learner: Trained, weights: Sequence[Tensor], batch: Data, others: Data) -> TensorsByName:
     return learner.losses(batch, weights, others)
 
 
@@ -130,7 +127,7 @@ def _seen(state: UpdateState) -> TensorsByName:
     return {name: value.mT if name in state.turned else value for name, value in tensors.items()}
 
 
-def _descend(learner: Learner, weights: Sequence[Tensor], state: UpdateState, gradients: Sequence[Tensor]) -> Tensor:
+def _descend(learner: Trained, weights: Sequence[Tensor], state: UpdateState, gradients: Sequence[Tensor]) -> Tensor:
     """Take the optimiser's step; return the norm of the gradients, of each seed where there are several."""
     is_stacked = state.tensors is not None
     if is_stacked:
@@ -150,7 +147,7 @@ def _descend(learner: Learner, weights: Sequence[Tensor], state: UpdateState, gr
 
 
 def transform_gradients(
-    learner: Learner, weights: Sequence[Tensor], state: UpdateState, gradients: Sequence[Tensor]
+    learner: Trained, weights: Sequence[Tensor], state: UpdateState, gradients: Sequence[Tensor]
 ) -> Sequence[Tensor]:
     """Return the gradients of what is trained, given those of the weights."""
     if state.tensors is not None and learner.method.of_one_seed:
@@ -158,11 +155,11 @@ def transform_gradients(
     return _transform_gradients(learner, weights, gradients)
 
 
-def _transform_gradients(learner: Learner, weights: Sequence[Tensor], gradients: Sequence[Tensor]) -> Sequence[Tensor]:
+def _transform_gradients(learner: Trained, weights: Sequence[Tensor], gradients: Sequence[Tensor]) -> Sequence[Tensor]:
     return learner.method.transform_gradients(gradients, weights)
 
 
-def _after_step(learner: Learner, weights: Sequence[Tensor]) -> tuple[()]:
+def _after_step(learner: Trained, weights: Sequence[Tensor]) -> tuple[()]:
     learner.method.after_step(weights)
     return ()  # seeds are vectorised over what returns tensors, or none of them
 

@@ -134,12 +134,17 @@ def with_added(settings: ReadOnlyValues) -> NamedValues:
 
 
 def parameters_of(function: Any) -> dict[str, Parameter]:
-    """Return the arguments of a function or class by name; those that a class takes as ``**`` are its base's."""
+    """Return the arguments of a function or class by name.
+
+    Those that a class takes as ``**`` are the fields of its ``Settings``, a dataclass, or else its base's arguments.
+    """
     own = signature(function).parameters
     stars = (Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD)
     named = {name: parameter for name, parameter in own.items() if parameter.kind not in stars}
     hands_on = isinstance(function, type) and stars[1] in {parameter.kind for parameter in own.values()}
-    return parameters_of(function.__mro__[1]) | named if hands_on else named
+    if not hands_on:
+        return named
+    return parameters_of(getattr(function, "Settings", function.__mro__[1])) | named
 
 
 def check_arguments(group: str, given: Sequence[str], function: Any) -> None:

@@ -24,6 +24,7 @@ from baselines.parts.networks import GROUP
 from baselines.update import seeds as together
 from baselines.update.compiled import compiler_options
 from baselines.update.seeds import SeedGroup, why_not_together
+from baselines.update.step import update_state
 from baselines.update.update import update
 from benchmarks import agents as benchmark
 from benchmarks import environment_ladder as ladder_of_envs
@@ -207,7 +208,7 @@ def test_the_step_that_is_compiled_is_the_eager_one_but_for_rounding(small_agent
 
     eager = agent.gradient_step(minibatch)
     monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
-    whole = update(other, other.update_state, minibatch)
+    whole = update(other, update_state(other), minibatch)
 
     assert list(eager) == list(whole)
     torch.testing.assert_close(whole, eager)

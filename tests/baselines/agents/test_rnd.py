@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from helpers.small_agents import MINIBATCHES, batches, parameters_equal
@@ -84,7 +86,7 @@ def test_returns_of_the_bonus_go_over_the_ends_of_episodes_and_are_added_to_the_
     target = after[:, -1:]
     for step in reversed(range(8)):
         target = torch.cat([bonus[:, step, None, None] + 0.5 * target[:, :1], target], dim=1)
-    agent.bonus_coeff = 0.0
+    agent.settings = replace(agent.settings, bonus_coeff=0.0)
     torch.testing.assert_close(given["bonus_target"], target[:, :-1])
     torch.testing.assert_close(
         given["advantage"], agent.with_advantage(batch, agent.one_seed)["advantage"] + 0.5 * (target[:, :-1] - values)
