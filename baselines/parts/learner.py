@@ -18,8 +18,7 @@ from baselines.update.trained import Trained
 from baselines.update.update import update
 from ctgraph_rl.checks import TakesNumbers, at_least_one, positive, require, true_or_false
 
-MOST_PASSES = 10**6
-"""Passes over a batch, or gradient steps after it; more do not end."""
+MOST_PASSES = 10**6  # over a batch, or gradient steps after it; more do not end
 
 
 class Learner(TakesNumbers, Trained):
@@ -69,7 +68,7 @@ class Learner(TakesNumbers, Trained):
         for minibatch in self.minibatches(batch):
             measured = self.gradient_step(minibatch)
             steps.append(self.after_update(measured))
-        return self.after_batch(self.mean_measurements(steps)) if steps else {}
+        return self.after_batch(self.means(list(steps[0]), table_of(steps))) if steps else {}
 
     def minibatches(self, batch: TensorDictBase) -> Iterator[Items]:
         """Yield the minibatches of a batch, each for one gradient step, which is taken before the next is made."""
@@ -82,10 +81,6 @@ class Learner(TakesNumbers, Trained):
     def after_update(self, measured: TensorsByName) -> TensorsByName:
         """Called after a gradient step with what was measured in it; return what is worth logging of that."""
         return measured
-
-    def mean_measurements(self, steps: list[TensorsByName]) -> dict[str, float]:
-        """Return the mean of each measurement over gradient steps."""
-        return self.means(list(steps[0]), table_of(steps))
 
     def means(self, names: Sequence[str], table: Tensor) -> dict[str, float]:
         """Return the means of a table of measurements, [names, gradient steps]."""

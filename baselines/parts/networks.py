@@ -375,7 +375,11 @@ class ActorCritic(TensorDictSequential):
 
     def outputs(self, data: Data) -> TensorsByName:
         """Compute ``log_probs`` of all actions and ``state_value`` at any number of steps, [..., n] each."""
-        return self.heads(self._parts[0].over_time(data))
+        trunk = self._parts[0]
+        if GROUP not in data:
+            return self.heads(trunk.over_time(data))
+        features, which = trunk.of_distinct(data)
+        return {key: value[which] for key, value in self.heads(features).items()}
 
     def one_step(self, data: Data) -> Items:
         """Compute `outputs` for one step of all rows, and with memory the next state under ``("next", key)``."""

@@ -33,11 +33,8 @@ from ctgraph_rl.checks import (
 )
 from ctgraph_rl.core.device import torchs_defaults
 
-MOST_LAYERS = 1000
-"""Far beyond what trains."""
-
-SMALLEST_DECAY = 1e-6
-"""TorchRL's advantages leave out terms below 1e-7, and need at least one."""
+MOST_LAYERS = 1000  # far beyond what trains
+SMALLEST_DECAY = 1e-6  # TorchRL's advantages leave out terms below 1e-7, and need at least one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +79,6 @@ class Seeds(NamedTuple):
     """Whose rows a batch has: those of one agent, or the same number of each of several."""
 
     count: int
-
     values: Callable[[Items], Tensor]
     """Computes the values, [n, 1], at n frames of all seeds, the same number of each."""
 
@@ -150,15 +146,8 @@ class PolicyGradient(Learner):
             networks.make_orthogonal(self.trunk, self.actor, self.critic)
 
     def evaluate_actions(self, batch: Data) -> tuple[Tensor, Tensor, Tensor]:
-        """Compute log-probabilities of all actions, those of the actions taken, and values, with the present networks.
-
-        The trunk runs once for actor and critic, and with ``deduplicate`` once for frames that have the same features.
-        """
-        if GROUP in batch:
-            features, which = self.trunk.of_distinct(batch)
-            outputs = {key: value[which] for key, value in self.policy.heads(features).items()}
-        else:
-            outputs = self.outputs(batch)
+        """Compute log-probabilities of all actions, those of the actions taken, and values, with present weights."""
+        outputs = self.policy.outputs(batch)
         log_probs = outputs["log_probs"]
         return log_probs, log_probs.gather(-1, batch["action"].unsqueeze(-1)), outputs["state_value"]
 

@@ -19,6 +19,7 @@ from torchrl.modules import EGreedyModule
 from baselines.parts.learner import MOST_PASSES, Learner
 from baselines.parts.networks import Data, Items, TensorsByName, guided, is_greedy, most_likely
 from baselines.parts.prioritized import PrioritySampler
+from baselines.update.measured import table_of
 from baselines.update.update import make_optimiser
 from ctgraph_rl.checks import NamedValues, at_least_one, at_most, fraction, one_of, positive, require, require_memory
 from ctgraph_rl.core.device import torchs_defaults
@@ -256,7 +257,7 @@ class QLearner(Learner):
         """Set the priorities of the replayed items, and copy the weights to the target network if it is time."""
         squared = measured.pop("td_error", None)
         if self.prioritized and squared is not None:
-            self.mean_measurements([measured])  # raises before a priority becomes NaN
+            self.means(list(measured), table_of([measured]))  # raises before a priority becomes NaN
             self.replay.update_priority(self.replayed, squared.cpu().sqrt())
         self.target_age += 1
         if self.target_age == self.target_update_interval:
