@@ -6,7 +6,7 @@ Schulman et al. 2017 (arXiv 1707.06347).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torchrl.data import Composite, TensorSpec
@@ -41,7 +41,7 @@ class PPOSettings(PolicyGradientSettings):
 class PPO(PolicyGradient):
     """PPO for tasks that need no memory; its settings are `PPOSettings`."""
 
-    Settings = PPOSettings
+    Settings: ClassVar[Any] = PPOSettings
     solves = "fully observable tasks (CT-FO)"
 
     def __init__(self, observation_spec: Composite, action_spec: TensorSpec, **settings: Any) -> None:

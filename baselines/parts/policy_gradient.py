@@ -78,7 +78,7 @@ class PolicyGradientSettings:
 class Seeds(NamedTuple):
     """Whose rows a batch has: those of one agent, or the same number of each of several."""
 
-    count: int
+    number: int
     values: Callable[[Items], Tensor]
     """Computes the values, [n, 1], at n frames of all seeds, the same number of each."""
 
@@ -98,7 +98,7 @@ class PolicyGradient(Learner):
         settings: the fields of the class's `Settings`.
     """
 
-    Settings: ClassVar[type[PolicyGradientSettings]] = PolicyGradientSettings
+    Settings: ClassVar[Any] = PolicyGradientSettings
     settings: Any
     num_epochs = num_minibatches = 1
     output_keys = ("log_probs", "state_value")
@@ -168,12 +168,12 @@ class PolicyGradient(Learner):
         """Yield the minibatches of several seeds, [seeds, frames or rows, ...] each; ``batch`` has all their rows."""
         items = {}
         for key, value in self.with_advantage(batch, seeds).items():
-            of_seeds = value.unflatten(0, (seeds.count, -1))
+            of_seeds = value.unflatten(0, (seeds.number, -1))
             items[key] = of_seeds if self.memory else of_seeds.flatten(1, 2)
-        number = items["action"].shape[1]
-        first = number * torch.arange(seeds.count, device=items["action"].device).unsqueeze(1)
+        count = items["action"].shape[1]
+        first = count * torch.arange(seeds.number, device=items["action"].device).unsqueeze(1)
         for _ in range(self.num_epochs):
-            places = (first + seeds.orders(number)).flatten()
+            places = (first + seeds.orders(count)).flatten()
             parts = {}
             for key, value in items.items():
                 shuffled = value.flatten(0, 1).index_select(0, places).view_as(value)
@@ -203,7 +203,7 @@ class PolicyGradient(Learner):
         cut = (after["done"] & ~after["terminated"]).squeeze(-1)
         cut[:, -1] = True
         next_values = values.roll(-1, dims=1)
-        if cut.is_cpu and seeds.count == 1:
+        if cut.is_cpu and seeds.number == 1:
             next_values[cut] = seeds.values({key: after[key][cut] for key in self.trunk.in_keys})
         else:  # a choice of frames would make the host wait for a GPU, and seeds differ in their number
             computed = seeds.values({key: after[key].flatten(0, 1) for key in self.trunk.in_keys})
@@ -216,7 +216,7 @@ class PolicyGradient(Learner):
         """Return what `with_advantage` does; values and flags are [rows, steps, 1]."""
         advantage, target = self.advantages(batch, next_values, done, terminated)
         if self.settings.normalize_advantage:
-            of_seeds = advantage.unflatten(0, (seeds.count, -1))
+            of_seeds = advantage.unflatten(0, (seeds.number, -1))
             mean = of_seeds.mean(dim=(1, 2, 3), keepdim=True)
             deviation = of_seeds.std(dim=(1, 2, 3), correction=0, keepdim=True)
             advantage = ((of_seeds - mean) / (deviation + 1e-8)).flatten(0, 1)
