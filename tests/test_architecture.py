@@ -64,7 +64,9 @@ KNOW_HYDRA = (
     "ctgraph_rl.run",
     "ctgraph_rl.runs.config",
     "ctgraph_rl.runs.job",
+    "ctgraph_rl.runs.on_dask",
     "ctgraph_rl.runs.sweep",
+    "hydra_plugins.ctgraph_rl_dask",
     "hydra_plugins.ctgraph_rl_sweeper",
 )
 
