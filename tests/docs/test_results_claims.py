@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from itertools import product
+from statistics import NormalDist
 
 import pytest
 from helpers.paths import CHECKOUT
 from omegaconf import OmegaConf
 
 import curricula
-from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.report import statistics
 from ctgraph_rl.tasks.configurations import ct_fo_b2
 
 
@@ -149,31 +151,10 @@ def test_the_other_agents_with_memory_solve_what_they_were_run_on_in_every_seed(
     )
 
 
-def test_a_cell_that_lacks_a_seed_is_not_collected(make):
-    from studies.baselines import runs, search
-
-    lines = make.read("baselines_b1_instances")
-
-    assert search.whole([{"seed": str(seed)} for seed in (0, 1, 2, 3, 3)]) == []
-    assert runs.five_seeds(lines[:4]) == [] and runs.five_seeds(lines[:7]) == lines[:5]
-
-
 def test_rewards_met_are_those_of_the_runs_of_the_table(make):
     of = {name: {line["fingerprint"] for line in make.read(name)} for name in ("baselines_fo_b2", "rewards_met")}
 
     assert of["rewards_met"] == of["baselines_fo_b2"]
-
-
-def test_rewards_are_counted_over_all_training_intervals(monkeypatch, tmp_path):
-    from studies.baselines import runs
-
-    log = RunLog()
-    for episodes, rate in ((4, 0.25), (0, float("nan")), (10, 0.3)):
-        log.append("training", block=1, frames=8, episodes=episodes, success_rate=rate)
-    monkeypatch.setattr("ctgraph_rl.load", lambda run_dir: type("Trained", (), {"log": log}))
-    monkeypatch.setattr(runs, "who_learned", lambda run_dir, trained: {"agent": "a2c"})
-
-    assert runs.rewards_met(tmp_path) == {"agent": "a2c", "episodes": 14, "rewards_met": 4}
 
 
 def test_a2c_ends_near_a_policy_that_always_does_the_same_on_posr_b1(make):
@@ -276,32 +257,29 @@ def test_cells_of_all_tables_were_run_again_and_only_those_of_the_earlier_revisi
     assert "but for seed 2 of depth 4, which had not learned and now has, and seed 1 of depth 5" in HOW_MADE
 
 
-def test_a_cell_that_was_run_again_takes_the_place_of_its_line(monkeypatch, tmp_path):
-    from studies import reruns
-    from studies.baselines import runs
+def of_seeds_together(of):
+    """The paired comparison of each agent and measure, with the values alone and together, seed by seed."""
+    found = {}
+    for agent in dict.fromkeys(agent for agent, _ in of):
+        for measure in ("frames_to_90", "final_return"):
+            values = []
+            for way in ("alone", "together"):
+                lines = sorted(of[agent, way], key=lambda line: int(line["seed"]))
+                values.append([float(line[measure]) for line in lines])
+            alone, together = values
+            found[agent, measure] = statistics.compare(together, alone), alone, together
+    return found
 
-    written = []
-    cell = {"configuration": "fo_b1", "depth": "2", "task": "1.1", "agent": "ppo", "seed": "0"}
-    numbers = {"greedy_return": "1.0", "greedy_success": "1.0", "sampled_return": "0.5", "sampled_success": "0.5"}
-    tables = {"baselines_b1": [cell | numbers], "reruns": [reruns.line_of("baselines_b1", cell, 4, 0)]}
-    tables["main_job"] = []
-    monkeypatch.setattr(reruns, "read", tables.get)
-    monkeypatch.setattr(reruns, "write", lambda name, lines: written.extend(lines))
-    monkeypatch.setattr(runs, "measured", lambda run: cell | numbers | {"sampled_return": 0.25})
-    (tmp_path / "metrics.json").write_text("{}")
 
-    reruns.compare("baselines_b1", tmp_path)
-
-    assert written == [reruns.line_of("baselines_b1", cell, 4, 3)]
-    with pytest.raises(ValueError, match="holds no run of main_job: give the folder of its runs"):
-        reruns.compare("main_job", tmp_path)
+def detectable(comparison, num_seeds):
+    """The difference of means that a paired t-test at 5 % finds with a power of 0.9, normally approximated."""
+    normal = NormalDist()
+    return (normal.inv_cdf(0.975) + normal.inv_cdf(0.9)) * (comparison.std or 0.0) / math.sqrt(num_seeds)
 
 
 def test_seeds_together_learn_as_runs_alone_do_and_the_page_says_what_would_have_been_found(make):
-    from studies import together as as_alone
-
-    found = as_alone.comparisons()
-    sizes = {(line["way"], line["group_size"]) for line in make.read(as_alone.NAME)}
+    found = of_seeds_together(make.groups(make.read("together_fo_b1"), "agent", "way"))
+    sizes = {(line["way"], line["group_size"]) for line in make.read("together_fo_b1")}
 
     assert {agent for agent, _ in found} == {"ppo", "ppo_published", "ppo_count", "a2c", "reinforce", "dqn"}
     assert {(len(alone), len(together)) for _, alone, together in found.values()} == {(30, 30)}
@@ -311,7 +289,7 @@ def test_seeds_together_learn_as_runs_alone_do_and_the_page_says_what_would_have
     assert "are {} for PPO, {} with counts and {} for `ppo_published`.".format(*less) in TOGETHER
     equal = {agent: {each.ties for (name, _), (each, *_) in found.items() if name == agent} for agent, _ in found}
     assert equal["a2c"] | equal["dqn"] | equal["reinforce"] == {29, 30}
-    least = {key: as_alone.detectable(each, 30) for key, (each, *_) in found.items()}
+    least = {key: detectable(each, 30) for key, (each, *_) in found.items()}
     said = [
         (f"{least[name, 'frames_to_90']:.0f}", f"{least[name, 'final_return']:.3f}") for name in ("ppo", "ppo_count")
     ]

@@ -16,14 +16,11 @@ from studies.raw import (
     TEMPLATES,
     Raw,
     groups,
-    lines_of_runs,
-    machine_of,
     machines,
     mean_of,
     read,
     shown,
     table,
-    write,
 )
 from studies.sentences import Sentences
 from studies.verdicts import seeds_that_would_do
@@ -52,50 +49,6 @@ SURJECTIVE = "surjective"
 
 WITHOUT_MEMORY = (1 + 1 + 0.25 + 0.25) / 4
 """The most that a policy which sees one image at all decisions gets, over the goals 1.1, 2.2, 1.2 and 2.1."""
-
-
-def collect(name: str, folders: Sequence[Path]) -> None:
-    """Write a line for each episode of rows in the last evaluation of the finished runs under some folders."""
-    lines = lines_of_runs(folders, measured)
-    order = ("depth", "kind", "agent", "gate", "seed")
-    write(name, sorted(lines, key=lambda line: tuple(line[key] for key in order)))
-
-
-def measured(run: Path) -> list[dict[str, Any]]:
-    """Return a line for each episode of rows in the last evaluation of a run: means over its tasks."""
-    from ctgraph_rl.log.files import LOG
-    from ctgraph_rl.log.run_log import RunLog
-
-    log = RunLog.read(run / LOG)
-    about = log.of_kind("run")[0]
-    config = about["config"]
-    adaptation = log.adaptation()
-    if adaptation is None:
-        raise ValueError(f"{run} has no evaluation with adaptation: run it with evaluation.adapt_episodes")
-    common = {
-        "depth": config["curriculum"]["depth"],
-        "kind": config["curriculum"].get("kind", FULL),
-        "agent": config["agent"]["_target_"].split(".")[1],
-        "gate": config["agent"].get("gate", "none"),
-        "seed": config["seed"],
-        "frames": log.of_kind("adaptation")[-1]["frames"],
-        "adapt_episodes": config["evaluation"]["adapt_episodes"],
-        **machine_of(about),
-    }
-    success = adaptation.success.mean(dim=0).tolist()
-    returns = adaptation.returns.mean(dim=0).tolist()
-    exact = adaptation.exact.mean(dim=0).tolist()
-    episodes = enumerate(zip(success, returns, exact, strict=True), start=1)
-    return [
-        {
-            **common,
-            "episode": episode,
-            "success": round(reached, 6),
-            "return": round(gained, 6),
-            "best_search": round(best, 6),
-        }
-        for episode, (reached, gained, best) in episodes
-    ]
 
 
 def lines_of(depth: int, kind: str) -> Raw:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
 from statistics import fmean
-from typing import Any
 
-from studies.raw import groups, lines_of_runs, machine_of, mean_of, read, table, write
+from studies.raw import groups, mean_of, read, table
 
 NAME = "adaptation_swap"
 
@@ -27,38 +24,6 @@ def best_search(goals: int, swapped: bool) -> float:
     if swapped:
         misses += (goals - 1) / goals * (1 + (goals - 2) / 2)
     return 1 - misses / EPISODES
-
-
-def collect(name: str, folders: Sequence[Path]) -> None:
-    """Write a line for each task of the last evaluation of the finished runs under some folders."""
-    lines = lines_of_runs(folders, measured)
-    write(name, sorted(lines, key=lambda line: (line["agent"], line["seed"], line["task"])))
-
-
-def measured(run: Path) -> list[dict[str, Any]]:
-    """Return a line for each task of the last evaluation of a run."""
-    from ctgraph_rl.log.files import LOG
-    from ctgraph_rl.log.run_log import RunLog
-
-    log = RunLog.read(run / LOG)
-    about = log.of_kind("run")[0]
-    evaluations = log.of_kind("evaluation")
-    frames = evaluations[-1]["frames"]
-    return [
-        {
-            "agent": about["config"]["agent"]["_target_"].split(".")[1],
-            "seed": about["config"]["seed"],
-            "frames": frames,
-            "task": line["task"],
-            "label": line["label"],
-            "held_out": line["held_out"],
-            "success": round(line["success_rate"], 6),
-            "return": round(line["return_mean"], 6),
-            **machine_of(about),
-        }
-        for line in evaluations
-        if line["frames"] == frames
-    ]
 
 
 def shares(agent: str, held_out: bool) -> list[float]:

@@ -10,8 +10,6 @@ from string import Template
 
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS
 from ctgraph_rl.tasks.values import open_loop_ceiling
-from studies import claim_runs
-from studies.claim_runs import runs
 from studies.lifelong import comparison
 from studies.memory.conditions import GIVEN, finished
 from studies.raw import HERE, TEMPLATES, Raw, groups, machines, numbers_in, read, shown, table
@@ -29,6 +27,7 @@ from studies.verdicts import (
     time,
 )
 
+NAME = "claim_runs"
 PAGE = HERE / "claims.md"
 
 OF_SUCCESS = 0.25
@@ -160,6 +159,13 @@ class Row:
         smallest = self.effect.smallest
         least = "none" if smallest is None else f"{smallest:.2f}"
         return [number, self.test, self.number, shown(self.effect.estimate), least, self.said]
+
+
+def runs(curriculum: str, **conditions: str) -> Raw:
+    """Return the lines of a curriculum under some conditions, by seed."""
+    lines = [line for line in read(NAME) if line["curriculum"] == curriculum]
+    found = [line for line in lines if all(line[key] == value for key, value in conditions.items())]
+    return sorted(found, key=lambda line: int(line["seed"]))
 
 
 def of_times(first: Raw, second: Raw, columns: Sequence[str]) -> Effect:
@@ -427,7 +433,7 @@ def page() -> str:
         of_failure=OF_FAILURE,
         of_pairs=OF_PAIRS,
         settings=settings(),
-        machines=machines("memory_cells", claim_runs.NAME),
+        machines=machines("memory_cells", NAME),
     )
 
 

@@ -20,11 +20,11 @@ NAME = "every_curriculum"
 KEY = ("curriculum", "agent", "method", "seed")
 
 
-def collect(name: str, folders: Sequence[Path]) -> None:
+def collect(folders: Sequence[Path]) -> None:
     """Write a line for each finished run under some folders."""
     paths = [path.parent for folder in folders for path in folder.rglob("metrics.json")]
     lines = [measured(path) for path in paths]
-    write(name, sorted(lines, key=lambda line: [str(line[column]) for column in KEY]))
+    write(NAME, sorted(lines, key=lambda line: [str(line[column]) for column in KEY]))
 
 
 def measured(run: Path) -> dict[str, Any]:

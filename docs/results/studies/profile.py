@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from statistics import median
 from string import Template
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from studies.raw import HERE, TEMPLATES, Raw, groups, machine_of, machines, read, table, write
+from studies.raw import HERE, TEMPLATES, Raw, groups, machines, read, table
 
 if TYPE_CHECKING:
-    from ctgraph_rl.log.run_log import RunLog
-    from ctgraph_rl.profile.scoring import Results, Score
+    from ctgraph_rl.profile.scoring import Score
     from curricula.profile import Property
 
 NAME = "profile"
@@ -22,69 +20,9 @@ PICTURE = HERE / "profile.png"
 AGENTS = {"ppo": "PPO", "lstm_ppo": "LSTM-PPO", "dqn": "DQN", "rl2": "RL^2"}
 """Agents in the order of tables."""
 
-CLASSES = {"PPO": "ppo", "LSTMPPO": "lstm_ppo", "DQN": "dqn", "RL2": "rl2"}
 
 FRESH = "fresh"
 """Name of the lines with the frames after which a fresh copy solves the last block of the lives."""
-
-GAP = ""
-
-
-def collect(name: str, folders: Sequence[Path]) -> None:
-    """Write a line for each seed of an agent in a property, one for each gap, and one for each fresh copy."""
-    from ctgraph_rl.profile.scoring import profile_results
-
-    lines = []
-    for agent, by_title in profile_results(folders).items():
-        for title, results in by_title.items():
-            for line in _lines(results):
-                lines.append({"agent": CLASSES[agent], "property": title, **line})
-    lines += _fresh_lines(folders)
-    for line in lines:
-        line.update(_machine(folders))
-    write(name, lines)
-
-
-def _lines(results: Results) -> list[dict[str, Any]]:
-    if not results.seeds:
-        return [{"seed": GAP, "value": GAP, "floors": GAP, "optimum": GAP, "highest": GAP, "reason": results.reason}]
-    lines = []
-    for seed, each in results.seeds.items():
-        floors = " ".join(f"{floor:.6g}" for floor in each.floors)
-        line = {"seed": seed, "value": f"{each.value:.6g}", "floors": floors, "optimum": f"{each.optimum:.6g}"}
-        lines.append({**line, "highest": f"{each.highest:.6g}", "reason": results.reason})
-    return lines
-
-
-def _fresh_lines(folders: Sequence[Path]) -> list[dict[str, Any]]:
-    """Return the frames after which each fresh copy reaches all goals; nothing where it does not."""
-    from ctgraph_rl.log.files import LOG
-    from ctgraph_rl.log.run_log import RunLog
-
-    lines = []
-    for path in sorted(path for folder in folders for path in folder.glob("profile_fresh/*/metrics.json")):
-        log = RunLog.read(path.parent / LOG)
-        config = log.of_kind("run")[0]["config"]
-        agent = CLASSES[config["agent"]["_target_"].rpartition(".")[2]]
-        value = _frames_to_all(log)
-        lines.append({"agent": agent, "property": FRESH, "seed": config["seed"], "value": value or GAP})
-    order = list(AGENTS)
-    return sorted(lines, key=lambda line: (order.index(line["agent"]), line["seed"]))
-
-
-def _frames_to_all(log: RunLog) -> int | None:
-    lowest: dict[int, float] = {}
-    for m in log.of_kind("evaluation"):
-        lowest[m["frames"]] = min(lowest.get(m["frames"], 1.0), m["return_mean"])
-    return next((frames for frames, value in lowest.items() if value >= 0.9), None)
-
-
-def _machine(folders: Sequence[Path]) -> dict[str, str]:
-    from ctgraph_rl.log.files import LOG
-    from ctgraph_rl.log.run_log import RunLog
-
-    first = next(path for folder in folders for path in folder.rglob(LOG))
-    return machine_of(RunLog.begun(first) or {})
 
 
 def make() -> None:

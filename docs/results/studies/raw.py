@@ -1,11 +1,11 @@
-"""Raw results as CSV files, which grow under ``runs/results`` while a study runs; and what tables are made of."""
+"""Raw results as CSV files, and what tables are made of."""
 
 from __future__ import annotations
 
 import csv
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,18 +20,12 @@ HERE = Path(__file__).resolve().parents[1]
 TEMPLATES = HERE / "templates"
 """Pages without their tables and numbers."""
 
-GROWING = HERE.parents[1] / "runs" / "results"
-"""Where tables grow until all of their runs are there; git ignores it."""
-
 Raw = list[dict[str, str]]
 
 MACHINE = ("machine", "cpu")
 """Columns for the kind of machine, with its instruction set, and the CPU's model; earlier files lack them."""
 
 NOT_RECORDED = "not recorded"
-
-MOST_NAMED = 12
-"""Runs that are lacking are named up to so many."""
 
 
 def read(name: str, folder: Path | None = None) -> Raw:
@@ -64,50 +58,6 @@ def write(name: str, lines: Sequence[Mapping[str, Any]], folder: Path | None = N
         writer = csv.DictWriter(file, list(columns), restval=NOT_RECORDED)
         writer.writeheader()
         writer.writerows(lines)
-
-
-def merged(name: str, new: Raw, key: Sequence[str], add: bool) -> Raw:
-    """The lines of some runs, and of other runs those that a table has so far while it grows.
-
-    Args:
-        name: of the table.
-        new: lines of runs.
-        key: columns that tell runs apart.
-        add: whether runs are added to the stored table: its other runs are among the lines.
-    """
-    found = groups(read(name), *key) if add else {}
-    found |= groups(read(name, GROWING), *key)
-    found |= groups(new, *key)
-    return [line for lines in found.values() for line in lines]
-
-
-def lost(name: str, lines: Raw, key: Sequence[str]) -> list[str]:
-    """The runs of a stored table that some lines lack, in words."""
-    there = groups(lines, *key)
-    return [" ".join(run) for run in groups(read(name), *key) if run not in there]
-
-
-def grow(tables: Mapping[str, Sequence[Mapping[str, Any]]], lacking: Sequence[str]) -> None:
-    """Write tables that grow: to `GROWING` while runs are lacking, and once, to where they are stored, at the end.
-
-    Args:
-        tables: their lines so far, by name.
-        lacking: the runs that they lack, in words.
-
-    Raises:
-        ValueError: where there are no lines at all.
-    """
-    if not any(tables.values()):
-        raise ValueError(f"no finished run of {', '.join(tables)}, whose files stay as they were: give its folder")
-    tables = {name: lines for name, lines in tables.items() if lines}
-    for name, lines in tables.items():
-        write(name, lines, GROWING if lacking else None)
-        if not lacking:
-            (GROWING / f"{name}.csv").unlink(missing_ok=True)
-    if lacking:
-        named = ", ".join(lacking[:MOST_NAMED]) + (" and others" if len(lacking) > MOST_NAMED else "")
-        files = ", ".join(f"{name}.csv" for name in tables)
-        print(f"To run for {files}, {len(lacking)} in all: {named}. The stored files stay as they were until then.")
 
 
 def machine_of(about: Mapping[str, Any]) -> dict[str, str]:
@@ -172,12 +122,6 @@ def interval_of(found: Estimate) -> str:
 
 def _number(value: float) -> str:
     return f"{value:.0f}" if 100 <= abs(value) < math.inf else f"{value:.2f}".replace("-0.00", "0.00")
-
-
-def lines_of_runs(folders: Sequence[Path], measured: Callable[[Path], list[dict[str, Any]]]) -> list[dict[str, Any]]:
-    """Return the lines that ``measured`` makes of each finished run under some folders, in the order of paths."""
-    paths = sorted(path for folder in folders for path in folder.rglob("metrics.json"))
-    return [line for path in paths for line in measured(path.parent)]
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -7,9 +7,8 @@ from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING
 
-from studies.baselines import main_job, search, swap
+from studies.baselines import instances, main_job, search, swap
 from studies.baselines.conclusions import says
-from studies.baselines.runs import AGENTS, BY_FIVES, EPISODES, REWARDS_MET
 from studies.raw import HERE, TEMPLATES, Raw, groups, machines, mean_of, read, share_of, table
 
 if TYPE_CHECKING:
@@ -19,6 +18,14 @@ if TYPE_CHECKING:
 PAGE = HERE / "baselines.md"
 OF_GOALS = (search.NAME, swap.NAME)
 """Tables of goals that change."""
+
+AGENTS = ("baselines_b1", "baselines_fo_b2", "depth_ladder")
+"""Tables of agents that each learned one task."""
+
+BY_FIVES = (instances.INSTANCES, instances.MEMORY)
+
+EPISODES = 1000
+"""Of the evaluation after training, greedy and sampled."""
 
 RND = ("rnd_depth", "rnd_co_b1")
 """Tables of PPO with random network distillation, beside those of other agents on the same tasks."""
@@ -118,7 +125,7 @@ def solved(lines: Raw) -> str:
 def learned_and_met() -> dict[str, str]:
     """What the page says of A2C on CT-FO-B2: seeds that learned each goal, by sampled episodes, and rewards met."""
     solved = [line for line in read("baselines_fo_b2") if line["agent"] == "a2c"]
-    met = groups(read(REWARDS_MET), "task")
+    met = groups(read("rewards_met"), "task")
     found = {}
     for task, lines in groups(solved, "task").items():
         goal, counts = task[0].replace(".", ""), [int(line["rewards_met"]) for line in met[task]]

@@ -2,46 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
-
-from studies.raw import Raw, groups, lines_of_runs, machine_of, read, write
+from studies.raw import Raw, groups, read
 
 NAME = "rl2_swap"
 
 LEARNED = 0.9
 """The least greedy return of a goal that is learned."""
-
-
-def collect(name: str, folders: Sequence[Path]) -> None:
-    """Write a line for each evaluation of the finished runs under some folders."""
-    lines = lines_of_runs(folders, measured)
-    write(name, sorted(lines, key=lambda line: (line["seed"], line["frames"], line["task"])))
-
-
-def measured(run: Path) -> list[dict[str, Any]]:
-    """Return a line for each evaluation of a run."""
-    from ctgraph_rl.log.files import LOG
-    from ctgraph_rl.log.run_log import RunLog
-
-    log = RunLog.read(run / LOG)
-    about = log.of_kind("run")[0]
-    common = {
-        "agent": run.name.split("-seed")[0],
-        "seed": about["config"]["seed"],
-        "curriculum": about["curriculum"].removesuffix(" (modified)"),
-    }
-    kept = ("block", "frames", "task", "label")
-    return [
-        {
-            **common,
-            **{key: line[key] for key in kept},
-            "greedy_return": round(line["return_mean"], 6),
-            **machine_of(about),
-        }
-        for line in log.of_kind("evaluation")
-    ]
 
 
 def runs() -> dict[tuple[str, ...], Raw]:

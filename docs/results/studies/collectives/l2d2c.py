@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
-from studies.collectives.runs import BLOCKS, CELL, NAME
 from studies.raw import Raw, groups, read
+
+NAME, BLOCKS = "collectives", "collective_blocks"
+"""Tables with a line for each collective, and for each member and block."""
+
+CELL = ("curriculum", "frames_of_block", "exchange", "num_members", "num_epochs")
+"""The columns that tell the cells of an experiment apart."""
+
+KEY = (*CELL, "seed")
 
 FRAMES = "12800"
 """Of a block."""

@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from statistics import fmean, variance
 
-from studies.collectives.runs import BLOCKS
+from studies.collectives.l2d2c import BLOCKS
 from studies.raw import Raw, groups, mean_of, numbers_in, read, table
 
 CURRICULUM, DEPTHS = "ct28_mosaic_skips_d5", range(2, 10)

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from studies.collectives import mosaic, selecting
 from studies.collectives.conclusions import says
-from studies.collectives.l2d2c import FRAMES, new_and_known, on_l2d2c
-from studies.collectives.runs import BLOCKS, CELL, KEY, NAME
+from studies.collectives.l2d2c import BLOCKS, CELL, FRAMES, KEY, NAME, new_and_known, on_l2d2c
 from studies.raw import HERE, TEMPLATES, Raw, groups, machines, mean_of, numbers_in, read, shown, table
 from studies.two_groups import two_groups
 

@@ -5,15 +5,14 @@ The page has numbers of an agent in a condition once all its seeds are there.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import partial
-from pathlib import Path
 from string import Template
 
-from studies.memory import figures, graphs, ladder, published
-from studies.memory.conditions import NAME, SHARED, TO_FIND, UNIQUE, Condition, finished
-from studies.memory.runs import AGENTS, SETTINGS, count, measured, ranking
-from studies.raw import HERE, TEMPLATES, Raw, grow, lost, machines, merged
+from studies.memory import figures, graphs, ladder
+from studies.memory.conditions import NAME, SHARED, TO_FIND, UNIQUE, finished
+from studies.memory.runs import count, ranking, solved, solved_once
+from studies.raw import HERE, TEMPLATES, machines, numbers_in, read
+
+PUBLISHED = "mohqa_published"
 
 LENGTHS = {
     "reinforce_short": "reinforce, 8 steps",
@@ -22,40 +21,12 @@ LENGTHS = {
 """Agents that differ in the steps of their batches."""
 
 
-def collect(name: str, folders: Sequence[Path], add: bool = False) -> None:
-    """Add the finished runs under some folders to tables that grow until they have all runs of the stored ones.
-
-    The table is of the experiment ``memory_cells``, memory_ladder.csv of ``memory_search`` and ``memory_ladder``.
-
-    Args:
-        name: of the first table.
-        folders: with run directories.
-        add: whether runs that are not under the folders stay as the stored tables have them.
-    """
-    paths = [path for folder in folders for path in folder.rglob("metrics.json") if "experts" not in path.parts]
-    lines = [measured(path.parent) for path in paths]
-    on_ladder = [line for line in lines if "expected_length" in line]
-    on_graphs = [line for line in lines if "expected_length" not in line]
-    tables: dict[str, Raw] = {}
-    lacking: list[str] = []
-    for table, own, keys in (
-        (name, on_graphs, Condition._fields),
-        (ladder.NAME, on_ladder, ("depth", "expected_length", *SETTINGS)),
-    ):
-        all_runs = merged(table, own, (*keys, "agent", "seed"), add)
-        tables[table] = sorted(all_runs, key=partial(_place, keys))
-        lacking += lost(table, all_runs, (*keys, "agent", "seed"))
-    grow(tables, lacking)
-
-
-def _place(keys: Sequence[str], line: dict[str, str]) -> tuple[list[float], int, int]:
-    """Return what lines are ordered by: numbers of a condition, the place of the agent, and the seed."""
-    return [_number(line[key]) for key in keys], list(AGENTS).index(line["agent"]), int(line["seed"])
-
-
-def _number(value: object) -> float:
-    """Return the number of a column, of which some hold truth values, as text or not."""
-    return float(str(value) == "True") if str(value) in ("True", "False") else float(str(value))
+def published() -> str:
+    """Return the greedy returns of MOHQA with its published settings, and how many seeds solve the task."""
+    lines = read(PUBLISHED)
+    returns = " and ".join(f"{value:.2f}" for value in numbers_in(lines, "greedy_return"))
+    after = f"{sum(solved(lines))} of {len(lines)} seeds solve it"
+    return f"{returns} ({after}, {sum(solved_once(lines))} at any evaluation)"
 
 
 def texts() -> dict[str, str]:
@@ -72,7 +43,7 @@ def texts() -> dict[str, str]:
     found["lower"], found["undecided"] = graphs.lower_and_undecided()
     found |= {"lost": graphs.lost(), "with_noise": graphs.with_noise()}
     found |= {"solve_shared": graphs.better_than_poor(SHARED), "solve_unique": graphs.better_than_poor(UNIQUE)}
-    return found | ladder.texts() | {"intervals": graphs.intervals(), "published": published.text()}
+    return found | ladder.texts() | {"intervals": graphs.intervals(), "published": published()}
 
 
 def page() -> str:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
 
-from studies.raw import Raw, machine_of
+from studies.raw import Raw
 
 SEEDS = 5
 
@@ -41,62 +38,9 @@ AGENTS = {
 LADDER_CELLS = [name for name in AGENTS if name.startswith("lstm_ppo") and name != "lstm_ppo-attention"]
 """Agents on the ladder."""
 
-STEPS = {"dqn": "n_steps", "a2c": "num_steps", "reinforce": "num_steps"}
-"""The setting that tells the runs of an agent apart: the steps of its targets, or of its batches."""
 
 SETTINGS = ("num_envs", "num_steps", "learning_rate", "entropy_coeff")
 """What differs between runs on the ladder: the environments, the steps of a sequence, learning rate, entropy bonus."""
-
-
-def measured(run: Path) -> dict[str, Any]:
-    """Return the line of a finished run: its condition, its final returns, and how soon it was near the optimum."""
-    from ctgraph_rl.log.files import LOG
-    from ctgraph_rl.log.run_log import RunLog
-
-    log = RunLog.read(run / LOG)
-    about, metrics = log.of_kind("run")[0], json.loads((run / "metrics.json").read_text(encoding="utf-8"))
-    evaluations, training = log.of_kind("evaluation"), log.of_kind("training")
-    frames, best = training[-1]["frames"], metrics["optimal_performance"]["value"]
-    last = [line for line in training if line["frames"] > frames - TAIL and line["episodes"]]
-    reached = (line["frames"] for line in evaluations if line["return_mean"] >= SOLVED * best)
-    gap = metrics["memory_gap_closed"]
-    return {
-        "agent": agent_of(run, about["config"]),
-        "seed": about["config"]["seed"],
-        **condition(about["config"]),
-        "frames": frames,
-        "greedy_return": evaluations[-1]["return_mean"],
-        **{f"training_{name}": round(_mean_over(last, f"{name}_mean"), 6) for name in ("return", "length")},
-        **({"frames_to_90": next(reached, "")} if len(evaluations) > 1 else {}),
-        "memory_gap_closed": gap["value"] if gap["value"] is not None else gap["undefined"],
-        "optimum": best,
-        "ceiling_without_memory": metrics["memoryless_ceiling"]["value"],
-        **machine_of(about),
-    }
-
-
-def _mean_over(lines: list[dict[str, Any]], key: str) -> float:
-    """Return a mean over the episodes of some lines of a log."""
-    return sum(line[key] * line["episodes"] for line in lines) / sum(line["episodes"] for line in lines)
-
-
-def agent_of(run: Path, config: dict[str, Any]) -> str:
-    """Return the key of `AGENTS` for a run."""
-    name = run.name.split("-seed")[0]
-    if name not in STEPS:
-        return name
-    steps = config["agent"][STEPS[name]]
-    return f"{name}, 1 step" if steps == 1 else f"{name}, {steps} steps"
-
-
-def condition(config: dict[str, Any]) -> dict[str, Any]:
-    """Return the columns that tell conditions apart: those of the ladder if a run is of it, else those of a graph."""
-    curriculum = config["curriculum"]
-    if curriculum["expected_length"]:
-        graph = {key: curriculum[key] for key in ("depth", "expected_length")}
-        return graph | {key: config["agent"][key] for key in SETTINGS}
-    graph = {key: curriculum[key] for key in ("wait_prob", "unique_decisions", "num_wait_images")}
-    return graph | {"guide_frames": config["protocol"]["guide_frames"] or 0, "read_noise": curriculum["read_noise"]}
 
 
 def returns(lines: Raw) -> list[float]:

@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from studies.no_labels.learners import LEARNERS, SEEDS, finished, values
-from studies.no_labels.runs import IMAGES, MASKS, PLANNED, SPANS
+from studies.no_labels.learners import IMAGES, LEARNERS, MASKS, PLANNED, SEEDS, SPANS, finished, values
 from studies.raw import Raw, groups, read
 
 COLOURS = ("#3b528b", "#5ec962", "#21918c", "#fde725")

@@ -4,8 +4,23 @@ from __future__ import annotations
 
 from functools import cache
 
-from studies.no_labels.runs import NAME, PLANNED
 from studies.raw import Raw, groups, read
+
+NAME, SPANS = "no_labels", "no_labels_spans"
+
+FOUND = ("detector", "method", "num_fresh", "boundaries")
+"""The columns that tell the learners of a curriculum apart."""
+
+MASKS, PAIR = "swoks_2x4", "dick2020_pair"
+IMAGES = ("fo_b1_4images", "su_b1_4images", "co_b1_4images", "posr_b1_4images")
+
+PLANNED = {
+    (MASKS, "384000"): ("announced", "oracle", "swoks", "swoks, fresh", "adwin", "none"),
+    (PAIR, "51200"): ("announced", "oracle", "amd", "swoks", "adwin", "none"),
+    (PAIR, "204800"): ("announced", "oracle", "amd", "swoks, fresh", "adwin", "none"),
+    **{(name, "204800"): ("announced", "oracle", "swoks, fresh", "adwin", "none") for name in IMAGES},
+}
+"""Curricula, frames of a stay, and learners of the experiments."""
 
 SEEDS = 5
 

@@ -9,8 +9,7 @@ from string import Template
 from ctgraph_rl.report.statistics import Comparison
 from studies.lifelong.pairs import of_pairs, rows
 from studies.no_labels import figures, task_free
-from studies.no_labels.learners import LEARNERS, finished, values
-from studies.no_labels.runs import FOUND, IMAGES, MASKS, NAME, PLANNED, SPANS
+from studies.no_labels.learners import FOUND, IMAGES, LEARNERS, MASKS, NAME, PLANNED, SPANS, finished, values
 from studies.raw import HERE, TEMPLATES, Raw, groups, machines, mean_of, read, table
 from studies.verdicts import undecided
 

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
 from statistics import mean
 
 from studies.no_labels.learners import LEARNERS, learner, values
-from studies.no_labels.runs import measured
-from studies.raw import Raw, groups, mean_of, read, table, write
+from studies.raw import Raw, groups, mean_of, read, table
 
 NAME = "task_free"
 
@@ -20,13 +17,6 @@ PLANNED = {
 """Curricula and learners of the experiment; the oracle refuses gradual changes."""
 
 SEEDS = 3
-
-
-def collect(name: str, folders: Sequence[Path]) -> None:
-    """Write a line for each finished run under some folders."""
-    paths = [path for folder in folders for path in folder.rglob("metrics.json")]
-    lines = [measured(path.parent)[0] for path in paths if path.parent.parent.name in PLANNED]
-    write(name, sorted(lines, key=lambda line: (line["curriculum"], line["detector"], line["seed"])))
 
 
 def cells() -> dict[tuple[str, str], Raw]:
