@@ -55,7 +55,7 @@ def cells():
 @pytest.fixture(scope="module")
 def names(cells) -> dict[str, str]:
     """What the page calls each agent."""
-    return cells.AGENTS
+    return cells.graphs.AGENTS
 
 
 def read(name: str, *keys: str) -> dict[tuple[str, ...], Lines]:
@@ -108,7 +108,10 @@ def test_the_page_is_what_its_raw_results_make(cells):
 
 
 def test_each_run_is_one_line_with_the_share_of_the_gap_or_its_reason(cells):
-    conditions = {"memory_cells": cells.Condition._fields, "memory_ladder": ("depth", "expected_length", *SETTINGS)}
+    conditions = {
+        "memory_cells": cells.graphs.Condition._fields,
+        "memory_ladder": ("depth", "expected_length", *SETTINGS),
+    }
 
     for name, keys in conditions.items():
         assert {len(lines) for lines in read(name, "agent", "seed", *keys).values()} == {1}
@@ -300,7 +303,10 @@ def runs_of(command: str) -> set[tuple[str, ...]]:
 def test_the_commands_of_the_page_make_its_runs(cells):
     text = (FOLDER / "memory.md").read_text(encoding="utf-8").replace("\\\n", " ")
     commands = [line for line in text.splitlines() if line.startswith("ctgraph-rl -m experiment=")]
-    conditions = {"memory_cells": cells.Condition._fields, "memory_ladder": ("depth", "expected_length", *SETTINGS)}
+    conditions = {
+        "memory_cells": cells.graphs.Condition._fields,
+        "memory_ladder": ("depth", "expected_length", *SETTINGS),
+    }
     recorded = (set(read(name, "agent", "seed", *keys)) for name, keys in conditions.items())
 
     assert set().union(*map(runs_of, commands)) == set().union(*recorded)

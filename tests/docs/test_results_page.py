@@ -104,28 +104,6 @@ def test_an_evaluation_of_the_lifelong_page_is_one_episode_of_a_return_in_0_to_1
     assert {line[key] for line in raw for key in line if key.isdigit()} - {""} == {"0.0", "1.0"}
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["baselines"], "invalid choice: 'baselines' (choose from"),
-        (["baselines_b1"], "no raw results of baselines_b1, whose file stays as it was: give the folder of its runs"),
-        (["main_job"], "no raw results of main_job, whose file stays as it was"),
-        (["masks_ct8"], "holds no finished run of masks_ct8: give the folder of its runs"),
-    ],
-)
-def test_what_cannot_be_collected_is_one_message_and_no_file_changes(capsys, tmp_path, arguments, message):
-    import make
-
-    before = {path: path.read_bytes() for path in FOLDER.glob("*.csv")}
-
-    with pytest.raises(SystemExit) as end:
-        make.main(["collect", *arguments, str(tmp_path)])
-
-    assert end.value.code == 2
-    assert message in capsys.readouterr().err
-    assert {path: path.read_bytes() for path in FOLDER.glob("*.csv")} == before
-
-
 def test_every_cell_of_the_small_configurations_has_five_seeds_that_finished(make):
     cells = make.groups(make.read("baselines_b1"), "configuration", "task", "agent")
 

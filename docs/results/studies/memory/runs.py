@@ -1,4 +1,4 @@
-"""Raw results of the experiments with memory cells, and what `memory_cells` and `memory_ladder` say of each run."""
+"""What the experiments with memory cells say of each run."""
 
 from __future__ import annotations
 
@@ -7,9 +7,6 @@ from collections.abc import Mapping
 from studies.raw import Raw
 
 SEEDS = 5
-
-TAIL = 40_960
-"""The last frames of a run, over whose training episodes the training return and the training length are means."""
 
 SOLVED = 0.9
 """The least greedy return of a seed that solves a task; the optimum is 1."""
@@ -37,7 +34,6 @@ AGENTS = {
 
 LADDER_CELLS = [name for name in AGENTS if name.startswith("lstm_ppo") and name != "lstm_ppo-attention"]
 """Agents on the ladder."""
-
 
 SETTINGS = ("num_envs", "num_steps", "learning_rate", "entropy_coeff")
 """What differs between runs on the ladder: the environments, the steps of a sequence, learning rate, entropy bonus."""
