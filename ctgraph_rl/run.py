@@ -58,32 +58,9 @@ def run(cfg: DictConfig, run_dir: Path) -> float | None:
     """
     check_packages()
     with first_imports():
-        from ctgraph_rl.collective import job  # here: --help and a wrong setting need no torch
+        from ctgraph_rl.runner import run_configuration  # here: --help and a wrong setting need no torch
 
-    run_dirs = job.run_cells(cfg, run_dir)
-    if cfg.report or not in_sweep():
-        for each in run_dirs:
-            show(each, cfg.report)
-    if cfg.objective is None or _sweeper() == "cells":
-        return None
-    return job.value_of(cfg, run_dir, run_dirs)
-
-
-def _sweeper() -> str | None:
-    """Return the name of the sweeper that runs this; None outside of a sweep."""
-    return HydraConfig.get().runtime.choices["hydra/sweeper"] if in_sweep() else None
-
-
-def show(run_dir: Path, report: bool) -> None:
-    """Print the results of a finished run, and make its report or say how."""
-    from ctgraph_rl.report.page import write_report  # here: --help and a wrong setting need no torch
-    from ctgraph_rl.report.terminal import print_summary  # here: as above
-
-    print_summary(run_dir)
-    here = Path.cwd()
-    shown = run_dir.relative_to(here) if run_dir.is_relative_to(here) else run_dir
-    print(f"results: {terminal_text(shown)}")
-    print(f"report: {write_report([shown]).page}" if report else makes_page(f"report {shlex.quote(str(shown))}"))
+    return run_configuration(cfg, run_dir)
 
 
 def show_sweep(run_dirs: Sequence[Path]) -> None:
@@ -164,7 +141,7 @@ class HydraJob:
         try:
             check_resolved(cfg)
             check_one_cell()
-            sweeper = _sweeper()
+            sweeper = HydraConfig.get().runtime.choices["hydra/sweeper"] if in_sweep() else None
             name_one = f"hydra/sweeper={sweeper} searches by a metric: name it, such as objective=average_performance"
             require((cfg.objective is not None or sweeper not in SEARCHERS, name_one))
             if cfg.portable is True and not in_sweep():
@@ -204,7 +181,10 @@ def main() -> None:
                 if given.help:
                     print(settings_help(given))
                     return
-                sys.argv = ["ctgraph-rl", *sweepable(in_digits(words))]
+                words = in_digits(words)
+                if given.multirun:
+                    words = sweepable(words)
+                sys.argv = ["ctgraph-rl", *words]
                 Sweeper.done = ()
                 of_hydra(hydra.main)(config_path=conf_dir(), config_name="config")(HydraJob())()
                 if Sweeper.done:

@@ -183,13 +183,15 @@ def learned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Path]:
 
     cells: list[Path] = []
 
-    def learn(cfg, run_dir, interrupt, built=None):
+    def learn(session, given, *_):
+        [(cfg, run_dir)] = given
         cells.append(run_dir)
         first = {"kind": "run", "config": config.plain(cfg), **job.code_of(cfg, {})}
         (run_dir / "run.jsonl").write_text(json.dumps(first) + "\n")
         if cfg.seed == UNLUCKY:
             raise FloatingPointError("the loss is NaN")
         (run_dir / "metrics.json").write_text("{}")
+        return {}
 
     monkeypatch.setattr(job, "learn", learn)
     monkeypatch.chdir(tmp_path)

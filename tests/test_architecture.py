@@ -34,7 +34,7 @@ FLOORS = (
     ("play", "hydra_plugins"),
     ("report",),
     ("collective", "board", "profile"),
-    ("cli", "describe", "compare", "testing"),
+    ("cli", "describe", "compare", "testing", "runner"),
     ("run",),
     ("benchmarks",),
 )
@@ -62,6 +62,7 @@ NEVER = {
 KNOW_HYDRA = (
     "ctgraph_rl.board.relearn",
     "ctgraph_rl.run",
+    "ctgraph_rl.runner",
     "ctgraph_rl.runs.config",
     "ctgraph_rl.runs.job",
     "ctgraph_rl.runs.on_dask",
@@ -74,10 +75,11 @@ DOORS = {
     "ctgraph_rl": "its names are imported when they are first used",
     "ctgraph_rl.cli": "the module of a command",
     "ctgraph_rl.log.named_curricula": "the curricula that are published",
+    "ctgraph_rl.log.provenance": "the fingerprints of those",
     "ctgraph_rl.packages": "classes by the names that runs stored, and wrappers of others",
     "ctgraph_rl.profile.properties": "a table that learns a model of an agent's data",
     "ctgraph_rl.profile.scoring": "the properties of the profile's curricula",
-    "ctgraph_rl.runs.seeds": "the batches of seeds, which know the agents",
+    "ctgraph_rl.runs.session": "the batches of seeds, which know the agents",
     "ctgraph_rl.board.relearn": "learners of others, in a process of their own",
     "ctgraph_rl.log.sources": "looks for modules of the user, and imports none",
     "ctgraph_rl.metrics": "all of its own modules, so that no metric is left out",
@@ -98,7 +100,6 @@ MODULES_OF_ONE_NAME = {
     "labels": "that learners give: in a log, as metrics, and as a figure",
     "masks": "of weights, and the sequences of the papers on them",
     "memory": "bytes of images, and sequences that need a memory",
-    "seeds": "as one batch: the learners, and the runs",
     "style": "of figures: of reports in print, and of pictures of tasks",
 }
 """Names of several modules, each said after its folder, and why."""

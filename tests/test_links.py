@@ -24,7 +24,7 @@ from ctgraph_rl.report.page import write_report
 from ctgraph_rl.runs.config import write_configuration
 from ctgraph_rl.runs.experts import find_or_train
 from ctgraph_rl.runs.load import load
-from ctgraph_rl.runs.status import mark_failure
+from ctgraph_rl.runs.session import mark_failure
 from ctgraph_rl.runs.trackers import Tracker, csv_logger
 
 WRITING = {
@@ -48,7 +48,7 @@ ALLOWED = {
     ("ctgraph_rl.report.page", "folder.mkdir"): "named by the user",
     ("ctgraph_rl.runs.checkpoints", "each.save"): "a method of Checkpoints, which writes through ctgraph_rl.disk",
     ("ctgraph_rl.runs.sweep", "folder.mkdir"): "named by the user",
-    ("ctgraph_rl.runs.seeds", "folder.mkdir"): "as above",
+    ("ctgraph_rl.runs.job", "folder.mkdir"): "as above",
     ("ctgraph_rl.runs.trackers", "folder.mkdir"): "after a link is refused",
 }
 """Calls outside of `ctgraph_rl.disk`, and why they follow no link of a stranger."""
@@ -175,7 +175,7 @@ def experts_of(run_dir: Path) -> None:
 def expert_dir(folder: Path) -> str:
     """The name that an expert's directory has."""
     made: list[Path] = []
-    learn = lambda _, run_dirs: made.extend(run_dirs.values()) or {}  # noqa: E731
+    learn = lambda _, run_dirs, session: made.extend(run_dirs.values()) or {}  # noqa: E731
     find_or_train(curricula.load("ct2_interfering"), learn, folder / "x", {0: {}}, print)
     return f"../{made[0].name}"
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 import ctgraph_rl
-from ctgraph_rl.runs.train import RESULTS
+from ctgraph_rl.log.sums import RESULTS
 
 BADGE = "https://img.shields.io/badge/python-"
 TINY = ["curriculum.num_frames=1024", "agent.num_envs=64", "agent.num_steps=8", "agent.hidden_size=8"]

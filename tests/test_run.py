@@ -18,12 +18,12 @@ import curricula
 from baselines.lstm_ppo import LSTMPPO
 from ctgraph_rl import Block, CTGraphEnv, Curriculum, Protocol, RunLog, evaluate, packages
 from ctgraph_rl.log.provenance import NUMBERS, name_in_logs
+from ctgraph_rl.log.sums import RESULTS
 from ctgraph_rl.metrics import definitions
 from ctgraph_rl.run import run
 from ctgraph_rl.runs import job
 from ctgraph_rl.runs.config import target
 from ctgraph_rl.runs.job import with_changes
-from ctgraph_rl.runs.train import RESULTS
 from curricula.paper import ct_su_b1
 
 SHORT = ("curriculum.num_frames=1024", "agent.num_envs=128", "agent.num_steps=8", "agent.hidden_size=8")
@@ -117,10 +117,18 @@ def test_the_same_seed_gives_the_same_log(finished, compose, tmp_path):
 
 def test_the_seed_decides_environment_and_evaluation_too(compose, monkeypatch, tmp_path):
     seeds = []
-    learn = "ctgraph_rl.runs.train.learn_curriculum"
-    monkeypatch.setattr(learn, lambda curriculum, agent, seed, log, *_, **how: seeds.append(seed))
 
-    run(compose("seed=7"), tmp_path)
+    class Stopped(Exception):
+        pass
+
+    def stop(curriculum, group, its_seeds, logs, **_):
+        seeds.extend(its_seeds)
+        raise Stopped
+
+    monkeypatch.setattr("ctgraph_rl.runs.session.Lockstep", stop)
+
+    with pytest.raises(Stopped):
+        run(compose("seed=7"), tmp_path)
 
     assert seeds == [7]
 

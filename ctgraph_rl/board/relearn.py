@@ -20,8 +20,7 @@ from omegaconf import DictConfig
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, require
 from ctgraph_rl.disk import write_whole
 from ctgraph_rl.runs import config
-from ctgraph_rl.runs.job import run_job
-from ctgraph_rl.runs.seeds import learn_experts, run_as_one
+from ctgraph_rl.runs.job import learn_experts, run_as_one, run_job
 from ctgraph_rl.runs.settings import with_added
 from ctgraph_rl.tasks.curriculum import Curriculum
 

@@ -15,8 +15,7 @@ from ctgraph_rl.board.tracks import Track
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule
 from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.escape import listed
-from ctgraph_rl.log.named_curricula import is_published
-from ctgraph_rl.log.provenance import NUMBERS, code_changes
+from ctgraph_rl.log.provenance import NUMBERS, code_changes, is_published
 from ctgraph_rl.log.sources import SCRIPTS, find_sources
 from ctgraph_rl.packages import class_named
 from ctgraph_rl.runs.load import OURS

@@ -7,72 +7,40 @@ import logging
 import shutil
 import sys
 from collections.abc import Sequence
-from contextlib import ExitStack, redirect_stdout
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
-import torch
+from rich.console import Console
 
-from ctgraph_rl.checks import ReadOnlyValues, require
+from ctgraph_rl.checks import require
 from ctgraph_rl.collective.summary import COLLECTIVE, FILES, describe_collective, read_collective, write_summary
 from ctgraph_rl.disk import made_folder
-from ctgraph_rl.learn.collective import ExchangeLike, Member, learn_collective
+from ctgraph_rl.learn.collective import ExchangeLike, learn_collective
 from ctgraph_rl.learn.progress import ProgressBar
 from ctgraph_rl.log.escape import terminal_text
-from ctgraph_rl.log.files import CHECKPOINTS, METRICS, list_members, locked, member_folder
+from ctgraph_rl.log.files import CHECKPOINTS, METRICS, member_folder
 from ctgraph_rl.log.provenance import code_changes, versions
 from ctgraph_rl.log.run_log import SCHEMA, RunLog
-from ctgraph_rl.report.objective import check_objective, objective_of
-from ctgraph_rl.report.style import require_packages
 from ctgraph_rl.runs import config
-from ctgraph_rl.runs.checkpoints import Checkpoints
-from ctgraph_rl.runs.experts import Failures
+from ctgraph_rl.runs.checkpoints import Checkpoints, RunState
 from ctgraph_rl.runs.interrupt import Interrupt
-from ctgraph_rl.runs.job import Job, code_of, first_line, is_finished, run_job
-from ctgraph_rl.runs.seeds import run_seeds
-from ctgraph_rl.runs.status import mark_failure
-from ctgraph_rl.runs.train import Participant, execute
+from ctgraph_rl.runs.job import (
+    ConfigAndPath,
+    build,
+    checkpoints_of,
+    code_of,
+    console_of_runs,
+    first_line,
+    is_finished,
+    prepare,
+    train_experts,
+)
+from ctgraph_rl.runs.session import Failures, RunMember, Session, mark_failure
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 LONG_ID = 1000
 """Numbers of a one-hot task id above which a collective warns."""
-
-Runs = Sequence[tuple[Any, Path]]
-"""The configuration and the directory of each member."""
-
-
-def run_cells(cfg: Any, run_dir: Path) -> list[Path]:
-    """Run a configuration: a collective if it has an ``exchange``, each of its ``seeds`` if a sweep lists them.
-
-    Returns:
-        The directories of single runs; those of a collective's members are within its own.
-    """
-    check_objective(cfg.objective, cfg.experts)
-    if cfg.report:
-        require_packages()
-    if "exchange" in cfg:
-        run_collective(cfg, run_dir)
-        if not config.in_sweep():
-            print(describe_collective(read_collective(run_dir)))
-        return []
-    if "seeds" in cfg:
-        return run_seeds(cfg, run_dir)
-    run_job(cfg, run_dir)
-    return [run_dir]
-
-
-def value_of(cfg: Any, run_dir: Path, run_dirs: Sequence[Path]) -> float:
-    """Return the objective of a configuration that `run_cells` has run, the mean of its single runs or members.
-
-    Args:
-        cfg: the configuration.
-        run_dir: its directory.
-        run_dirs: what `run_cells` has returned.
-
-    Raises:
-        ValueError: if a run has no value; says why.
-    """
-    return objective_of(cfg.objective, run_dirs or list_members(run_dir))
 
 
 def run_collective(cfg: Any, run_dir: Path) -> None:
@@ -89,70 +57,112 @@ def run_collective(cfg: Any, run_dir: Path) -> None:
     labels = "labels that learners give themselves do not name the same tasks for all: leave out detector or exchange"
     require((cfg.together is False, batch), ("detector" not in cfg, labels))
     exchange = config.target(cfg, "exchange")()
-    runs = []
+    cells = []
     for number in range(exchange.num_members):
         own = config.of_member(cfg, number, exchange.settings_of(number))
-        runs.append((own, member_folder(run_dir, number)))
-    with locked(run_dir):
-        for each, _ in runs:
+        cells.append((own, member_folder(run_dir, number)))
+    with Session(console_of_runs()) as session:
+        session.lock(run_dir)
+        for each, _ in cells:
             config.check_values(each)
-        if _is_finished(runs, run_dir):
+        with redirect_stdout(io.StringIO()):  # each would print it
+            finished = [is_finished(each, folder) for each, folder in cells]
+        if all(finished) and (run_dir / METRICS).exists():
             print("this configuration was run before; overwrite=true runs it again")
             shutil.rmtree(run_dir / CHECKPOINTS, ignore_errors=True)  # if it was killed at its very end
-            return
-        with Interrupt() as interrupt, mark_failure(run_dir):
-            _learn(cfg, runs, exchange, run_dir, interrupt=interrupt)
+        else:
+            _learn(session, cfg, cells, exchange, run_dir)
+    if not config.in_sweep():
+        print(describe_collective(read_collective(run_dir)))
 
 
-def _is_finished(runs: Runs, run_dir: Path) -> bool:
-    """Return whether all members' results and the collective's are there."""
-    with redirect_stdout(io.StringIO()):  # each would print it
-        finished = [is_finished(cfg, folder) for cfg, folder in runs]
-    return all(finished) and (run_dir / METRICS).exists()
-
-
-def _learn(cfg: Any, runs: Runs, exchange: ExchangeLike, run_dir: Path, *, interrupt: Interrupt) -> None:
+def _learn(session: Session, cfg: Any, cells: Sequence[ConfigAndPath], exchange: ExchangeLike, run_dir: Path) -> None:
     """Build the objects of all members, let them learn, and write the results."""
-    checkpoints = Checkpoints(run_dir / CHECKPOINTS, cfg.checkpoint_seconds, cfg.resume == "strict", interrupt)
-    jobs, random = _jobs(runs, interrupt)
-    _warn_of_long_ids([job.curriculum for job in jobs])
-    exchange.connect([job.agent for job in jobs])
-    if _is_replaced(cfg, runs):
-        checkpoints.clear()
-    with ExitStack() as stack:
-        for _, folder in runs:
-            stack.enter_context(locked(made_folder(folder)))
-        given = zip(jobs, runs, strict=True)
-        directories = [stack.enter_context(job.prepared(folder)) for job, (_, folder) in given]
-        checkpoints.tidy()
-        saved = checkpoints.newest()
-        done = 0 if saved is None else saved["frames"]
-        total = sum(job.curriculum.num_frames for job in jobs)
-        blocks = max(len(job.curriculum.blocks) for job in jobs)
-        progress = ProgressBar(blocks, total, directories[0].console, done)
+    with Interrupt() as interrupt, mark_failure(run_dir):
+        members = _members(cells, interrupt)
+        _warn_of_long_ids([member.curriculum for member in members])
+        exchange.connect([member.agent for member in members])
+        checkpoints = checkpoints_of(cfg, run_dir, interrupt)
+        if _is_replaced(cfg, cells):
+            checkpoints.clear()
+        for member in members:
+            session.lock(made_folder(member.run_dir))
+        for (each, _), member in zip(cells, members, strict=True):
+            prepare(session, each, member)
+            if each.experts:
+                experts, failed = train_experts([each], member.curriculum, interrupt)
+                for error in failed.values():
+                    raise error
+                member.experts = experts[member.seed]
+        session.learn(members, Exchanging(cfg, exchange, run_dir, checkpoints))
 
-        def learn(logs: Sequence[RunLog]) -> Failures:
-            parts = zip(jobs, logs, random, strict=True)
-            members = [Member(job.curriculum, job.agent, job.cfg.seed, log, state) for job, log, state in parts]
-            log = _log(cfg, members, run_dir, saved)
+
+class Exchanging:
+    """A coupling of learners that each learn a curriculum and exchange messages; see `learn_collective`.
+
+    Args:
+        cfg: the configuration of the collective.
+        exchange: what they tell each other.
+        run_dir: the directory of the collective.
+        checkpoints: those of all members together.
+    """
+
+    def __init__(self, cfg: Any, exchange: ExchangeLike, run_dir: Path, checkpoints: Checkpoints) -> None:
+        self.cfg = cfg
+        self.exchange = exchange
+        self.run_dir = run_dir
+        self.checkpoints = checkpoints
+        self.saved: RunState | None = None
+
+    def resume(self, members: Sequence[RunMember]) -> Sequence[RunState | None]:
+        """See `SessionCoupling`."""
+        self.checkpoints.tidy()
+        self.saved = self.checkpoints.newest()
+        return [None] * len(members) if self.saved is None else self.saved["members"]
+
+    def learn(
+        self, members: Sequence[RunMember], saved: Sequence[RunState | None], console: Console | None
+    ) -> Failures:
+        """See `SessionCoupling`."""
+        done = 0 if self.saved is None else self.saved["frames"]
+        total = sum(member.curriculum.num_frames for member in members)
+        blocks = max(len(member.curriculum.blocks) for member in members)
+        with ProgressBar(blocks, total, console, done) as progress:
+            log = self._log(members)
             learn_collective(
                 members,
-                exchange,
-                cfg.seed,
+                self.exchange,
+                self.cfg.seed,
                 log,
                 progress,
-                device=jobs[0].device,
-                saved=saved,
-                checkpoint=checkpoints.offer,
+                device=self.cfg.device,
+                saved=self.saved,
+                checkpoint=self.checkpoints.offer,
             )
             log.close()
-            return {}
+        return {}
 
-        pairs = zip(jobs, directories, strict=True)
-        participants = [Participant(job.curriculum, job.agent, directory) for job, directory in pairs]
-        execute(participants, [None] * len(jobs) if saved is None else saved["members"], learn, progress)
-        write_summary(run_dir)
-        checkpoints.clear()
+    def end(self, members: Sequence[RunMember], failed: Failures) -> None:
+        """See `SessionCoupling`."""
+        write_summary(self.run_dir)
+        self.checkpoints.clear()
+
+    def _log(self, members: Sequence[RunMember]) -> RunLog:
+        """Return the collective's log, new or as it was at a checkpoint."""
+        run_dir = self.run_dir
+        if self.saved is not None:
+            (run_dir / METRICS).unlink(missing_ok=True)
+            return RunLog.resume(run_dir / COLLECTIVE, self.saved["log"])
+        for name in reversed(FILES):
+            (run_dir / name).unlink(missing_ok=True)
+        log = RunLog(run_dir / COLLECTIVE)
+        about = [
+            {"seed": each.seed, "curriculum": each.curriculum.name, "labels": list(each.curriculum.labels)}
+            for each in members
+        ]
+        log.append("collective", schema=SCHEMA, members=about, versions=versions(), config=config.plain(self.cfg))
+        log.sync()
+        return log
 
 
 def _warn_of_long_ids(curricula: Sequence[Curriculum]) -> None:
@@ -168,44 +178,25 @@ def _warn_of_long_ids(curricula: Sequence[Curriculum]) -> None:
         )
 
 
-def _jobs(runs: Runs, interrupt: Interrupt) -> tuple[list[Job], list[torch.Tensor]]:
-    """Build the objects of all members; return them, and the state of torch's generator after each.
+def _members(cells: Sequence[ConfigAndPath], interrupt: Interrupt) -> list[RunMember]:
+    """Build the objects of all members.
 
     Raises:
         ValueError: names the member.
     """
-    jobs = []
-    random = []
-    for number, (cfg, _) in enumerate(runs):
+    members = []
+    for number, (cfg, folder) in enumerate(cells):
         try:
-            jobs.append(Job.of(cfg, interrupt))
+            members.append(build(cfg, folder, interrupt))
         except ValueError as error:
             agent = f"curriculum.agent={cfg.curriculum.agent}, " if "agent" in cfg.curriculum else ""
             raise ValueError(f"member {number} ({agent}seed={cfg.seed}): {error}") from error
-        random.append(torch.get_rng_state())
-    return jobs, random
+    return members
 
 
-def _is_replaced(cfg: Any, runs: Runs) -> bool:
+def _is_replaced(cfg: Any, cells: Sequence[ConfigAndPath]) -> bool:
     """Return whether the collective begins again, whatever its directory holds."""
     if cfg.overwrite != config.STALE:
         return bool(cfg.overwrite)
-    begun = [(first_line(folder), code_of(each, {})) for each, folder in runs]
+    begun = [(first_line(folder), code_of(each, {})) for each, folder in cells]
     return any(about is not None and code_changes(about, now) for about, now in begun)
-
-
-def _log(cfg: Any, members: Sequence[Member], run_dir: Path, saved: ReadOnlyValues | None) -> RunLog:
-    """Return the collective's log, new or as it was at a checkpoint."""
-    if saved is not None:
-        (run_dir / METRICS).unlink(missing_ok=True)
-        return RunLog.resume(run_dir / COLLECTIVE, saved["log"])
-    for name in reversed(FILES):
-        (run_dir / name).unlink(missing_ok=True)
-    log = RunLog(run_dir / COLLECTIVE)
-    about = [
-        {"seed": each.seed, "curriculum": each.curriculum.name, "labels": list(each.curriculum.labels)}
-        for each in members
-    ]
-    log.append("collective", schema=SCHEMA, members=about, versions=versions(), config=config.plain(cfg))
-    log.sync()
-    return log

@@ -81,7 +81,7 @@ class ExchangeLike(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Member:
     """A learner of a collective.
 

@@ -1,4 +1,4 @@
-"""The published curricula, which `curricula` has: by name, and whether a curriculum is one of them."""
+"""The published curricula, which `curricula` has, by name."""
 
 from __future__ import annotations
 
@@ -19,16 +19,3 @@ def curriculum_named(name: str) -> Curriculum:
     """
     check_packages()
     return import_module("curricula").load(name)
-
-
-def is_published(curriculum: Curriculum) -> bool | None:
-    """Return whether a curriculum is the published one of its name; None if no published one has this name.
-
-    Raises:
-        ValueError: see `check_packages`.
-    """
-    check_packages()
-    for name, _, _, _, fingerprint, _ in import_module("curricula").listed():
-        if name == curriculum.name:
-            return bool(fingerprint == curriculum.fingerprint)
-    return None

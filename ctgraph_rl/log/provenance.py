@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 from collections.abc import Iterable, Iterator
 from dataclasses import fields, is_dataclass
+from importlib import import_module
 from itertools import filterfalse
 from typing import Any
 
@@ -14,9 +15,9 @@ import torchrl
 
 from ctgraph_rl import __version__
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues
-from ctgraph_rl.log.named_curricula import is_published
 from ctgraph_rl.log.run_log import SCHEMA
 from ctgraph_rl.log.sources import find_sources, full_name, is_ours, targets
+from ctgraph_rl.packages import check_packages
 from ctgraph_rl.portable import cpu_model, is_portable
 from ctgraph_rl.tasks.curriculum import Curriculum
 
@@ -39,6 +40,19 @@ def versions() -> dict[str, str]:
         "tensordict": tensordict.__version__,
         "python": platform.python_version(),
     }
+
+
+def is_published(curriculum: Curriculum) -> bool | None:
+    """Return whether a curriculum is the published one of its name; None if no published one has this name.
+
+    Raises:
+        ValueError: see `check_packages`.
+    """
+    check_packages()
+    for name, _, _, _, fingerprint, _ in import_module("curricula").listed():
+        if name == curriculum.name:
+            return bool(fingerprint == curriculum.fingerprint)
+    return None
 
 
 def name_in_logs(curriculum: Curriculum) -> str:

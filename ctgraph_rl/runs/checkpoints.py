@@ -79,6 +79,10 @@ class Checkpoints:
         """
         offer_all([self], lambda: [state()], at_block_end)
 
+    def offer_one(self, states: Callable[[], Sequence[RunState]], at_block_end: bool) -> None:
+        """`offer` the one state of a list."""
+        self.offer(lambda: states()[0], at_block_end)
+
     def is_due(self, at_block_end: bool) -> bool:
         """Return whether it is time to save."""
         return at_block_end or self._last is None or time.monotonic() - self._last >= self.seconds

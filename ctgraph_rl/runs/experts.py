@@ -10,17 +10,19 @@ import hashlib
 import json
 import shutil
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+from rich.console import Console
+
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, require
 from ctgraph_rl.disk import made_folder
 from ctgraph_rl.log.damage import damaged
-from ctgraph_rl.log.files import CHECKPOINTS, LOG, METRICS, locked
+from ctgraph_rl.log.files import CHECKPOINTS, LOG, METRICS
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.runs.checkpoints import Checkpoints
+from ctgraph_rl.runs.session import Failures, Session
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.task_like import TaskLike
 from ctgraph_rl.tasks.protocol import Block, Protocol
@@ -28,11 +30,8 @@ from ctgraph_rl.tasks.protocol import Block, Protocol
 RunDirs = Mapping[int, Path]
 """The directory of each seed."""
 
-Failures = dict[int, FloatingPointError]
-"""The error of each seed that failed."""
-
-Learn = Callable[[Curriculum, RunDirs], Failures]
-"""Lets seeds learn a curriculum as one batch, or resumes what they began as one."""
+Learn = Callable[[Curriculum, RunDirs, Session], Failures]
+"""Lets seeds learn a curriculum as one batch, or resumes what they began as one, each into its locked directory."""
 
 EXPERT = "single-task expert"
 """The name of their curricula."""
@@ -97,6 +96,7 @@ def find_or_train(
     *,
     waiting: Callable[[], object] = lambda: None,
     only: int | None = None,
+    console: Console | None = None,
 ) -> tuple[dict[int, list[Expert]], Failures]:
     """Return each seed's experts of all tasks of a curriculum; those that the folder lacks are trained first.
 
@@ -110,6 +110,7 @@ def find_or_train(
         tell: is given a line about each expert.
         waiting: called every half second while another process trains one that is needed here.
         only: the position of the one task whose experts are needed, from 1; None: all.
+        console: where progress shows; default: standard error.
 
     Returns:
         The experts of each seed, and the error of each seed with an expert that failed, which then has none.
@@ -127,7 +128,7 @@ def find_or_train(
             run_dirs[seed] = folder / directory_name(alone[i], settings[seed])
             experts.append(Expert(i, alone[i].fingerprint, run_dirs[seed]))
         left = _left(run_dirs, what, tell)
-        for seed, error in _train(alone[i], learn, left, waiting).items():
+        for seed, error in _train(alone[i], learn, left, waiting, console).items():
             failed[seed] = FloatingPointError(f"{what}: {error}")
             del found[seed]
     return found, failed
@@ -144,14 +145,16 @@ def _left(run_dirs: RunDirs, what: str, tell: Callable[[str], object]) -> dict[i
     return left
 
 
-def _train(curriculum: Curriculum, learn: Learn, run_dirs: RunDirs, waiting: Callable[[], object]) -> Failures:
+def _train(
+    curriculum: Curriculum, learn: Learn, run_dirs: RunDirs, waiting: Callable[[], object], console: Console | None
+) -> Failures:
     """Train into directories, or resume what was begun there; wait while other processes train into them."""
     failed: Failures = {}
-    with ExitStack() as stack:
+    with Session(console) as session:
         for run_dir in sorted(run_dirs.values()):  # one order, so that no two processes wait for each other
-            stack.enter_context(locked(made_folder(run_dir), waiting))
+            session.lock(made_folder(run_dir), waiting)
         for group in _groups(curriculum, _untrained(run_dirs)):
-            failed |= learn(curriculum, group)
+            failed |= learn(curriculum, group, session)
     return failed
 
 

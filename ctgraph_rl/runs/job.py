@@ -1,13 +1,14 @@
-"""One run of a configuration: its objects are built once, learn, and leave files."""
+"""From a configuration to runs: its objects are built once, learn in a session, and leave files."""
 
 from __future__ import annotations
 
 import json
 import logging
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass, replace
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, nullcontext, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,32 +17,36 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from ctgraph_rl.agent import Agent, MethodLike
-from ctgraph_rl.checks import NamedValues, ReadOnlyValues, plain, require, takes_numbers
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_int, plain, require, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.disk import is_writable
 from ctgraph_rl.learn.refusals import notes
-from ctgraph_rl.log.files import CHECKPOINTS, CURRICULUM, LOG, METRICS, locked
+from ctgraph_rl.learn.stacked import why_not_together
+from ctgraph_rl.log.escape import terminal_text
+from ctgraph_rl.log.files import CHECKPOINTS, CURRICULUM, LOG, METRICS
 from ctgraph_rl.log.provenance import code, code_changes, is_unknown, learners, versions
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.sums import RESULTS
 from ctgraph_rl.portable import hold
 from ctgraph_rl.runs import config
 from ctgraph_rl.runs.checkpoints import Checkpoints
-from ctgraph_rl.runs.experts import Expert, Failures, RunDirs, expert_curriculum, find_or_train, is_of_group
+from ctgraph_rl.runs.experts import Expert, RunDirs, expert_curriculum, find_or_train, is_of_group
 from ctgraph_rl.runs.interrupt import Interrupt
-from ctgraph_rl.runs.settings import as_before, differences, flat
-from ctgraph_rl.runs.status import holds_results, mark_failure
-from ctgraph_rl.runs.trackers import FOLDER, Tracker
-from ctgraph_rl.runs.train import (
+from ctgraph_rl.runs.session import (
     START_AGAIN,
-    MakeAgent,
-    RunDirectory,
+    Failures,
+    OneBatch,
+    RunMember,
+    Session,
     is_whole,
-    new_agent,
+    mark_failure,
     remove_results,
-    train_alone,
-    with_method,
+    why_agents_learn_alone,
 )
+from ctgraph_rl.runs.settings import as_before, differences, flat
+from ctgraph_rl.runs.status import holds_results
+from ctgraph_rl.runs.trackers import FOLDER, Tracker
+from ctgraph_rl.runs.train import MakeAgent, new_agent, with_method
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import changed
 
@@ -49,140 +54,148 @@ OF_AN_EXPERT = ("agent", "seed", "device", "num_threads", "portable")
 """Settings that a single-task expert shares with the run that needs it."""
 
 
-@dataclass(frozen=True)
-class Job:
-    """The objects of a configuration.
+ConfigAndPath = tuple[Any, Path]
+"""A composed configuration, and the existing directory of its run."""
+
+
+def build(cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None = None) -> RunMember:
+    """Build the objects of a configuration, the agent last, which decides the state of torch's global generator.
 
     Args:
         cfg: the composed configuration.
-        curriculum: what is learned, with all changes of the configuration and the method.
-        agent: the learner with its method; torch's global generator is as its construction left it.
-        make_alone: builds the agent without a method, for single-task experts.
-        device: where environment and agent live.
+        run_dir: the directory of its run.
         interrupt: notices when the process is asked to stop.
+
+    Raises:
+        ValueError: for values out of range, and parts that do not go together.
     """
+    checked_device(cfg.device)
+    prepare_torch(cfg)
+    make_method = method_of(cfg)
+    make_alone = config.target(cfg, "agent")
+    curriculum = curriculum_of(cfg, make_method())
+    for task in curriculum.tasks if cfg.experts else ():  # refuses first what an agent cannot learn
+        new_agent(expert_curriculum(curriculum, task), make_alone, cfg.seed)
+    make_agent = with_method(make_alone, make_method, curriculum)
+    return make_member(cfg, run_dir, curriculum, make_agent, settings=config.plain(cfg), interrupt=interrupt)
 
-    cfg: DictConfig
-    curriculum: Curriculum
-    agent: Agent
-    make_alone: MakeAgent
-    device: torch.device
-    interrupt: Interrupt
 
-    @classmethod
-    def of(cls, cfg: DictConfig, interrupt: Interrupt) -> Job:
-        """Build the objects of a configuration, the agent last.
+def make_member(
+    cfg: DictConfig,
+    run_dir: Path,
+    curriculum: Curriculum,
+    make_agent: MakeAgent,
+    *,
+    settings: ReadOnlyValues,
+    interrupt: Interrupt | None,
+) -> RunMember:
+    """Build the agent of a run, or of its expert, and give it a directory; ``settings`` are what its log holds."""
+    agent = new_agent(curriculum, make_agent, cfg.seed, cfg.device)
+    return RunMember(
+        curriculum,
+        agent,
+        cfg.seed,
+        run_dir=run_dir,
+        config=settings,
+        checkpoints=checkpoints_of(cfg, run_dir, interrupt),
+        sources=learners(settings, agent),
+    )
 
-        Raises:
-            ValueError: for values out of range, and parts that do not go together.
-        """
-        device = checked_device(cfg.device)
-        prepare_torch(cfg)
-        make_method = method_of(cfg)
-        make_alone = config.target(cfg, "agent")
-        curriculum = curriculum_of(cfg, make_method())
-        for task in curriculum.tasks if cfg.experts else ():  # refuses first what an agent cannot learn
-            new_agent(expert_curriculum(curriculum, task), make_alone, cfg.seed)
-        agent = new_agent(curriculum, with_method(make_alone, make_method, curriculum), cfg.seed, device)
-        return cls(cfg, curriculum, agent, make_alone, device=device, interrupt=interrupt)
 
-    def learn(self, run_dir: Path) -> None:
-        """Learn into a directory; the single-task experts first, where the configuration asks for them."""
-        with self.prepared(run_dir) as where:
-            train_alone(self.curriculum, self.agent, where, self.cfg.seed, self.device)
+def checkpoints_of(cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None) -> Checkpoints:
+    """Return the checkpoints of a configuration in a directory."""
+    return Checkpoints(run_dir / CHECKPOINTS, cfg.checkpoint_seconds, cfg.resume == "strict", interrupt)
 
-    @contextmanager
-    def prepared(
-        self, run_dir: Path, together: Sequence[int] = (), experts: Sequence[Expert] | None = None
-    ) -> Iterator[RunDirectory]:
-        """Prepare a directory: results that are replaced are removed, experts are found or trained, trackers opened.
 
-        Args:
-            run_dir: the directory.
-            together: the seeds of the group that the run is trained in, if there are others.
-            experts: of each task, if they were trained before.
-        """
-        cfg = self.cfg
-        saved = self._checkpoints(run_dir)
-        with self._tracking(run_dir) as listeners:
-            if self._replaces(run_dir):
-                saved.clear()
-                remove_results(run_dir)
-            config.write_configuration(cfg, run_dir / ".hydra")
-            if cfg.experts and experts is None:
-                with torch.random.fork_rng():
-                    experts = self._experts()
-            yield RunDirectory(
-                run_dir,
-                config.plain(cfg),
-                saved,
-                together=together,
-                experts=experts,
-                listeners=listeners,
-                console=self._console,
-            )
+def console_of_runs() -> Console | None:
+    """Return where progress shows: a sweep shows none of its runs."""
+    return Console(quiet=True) if config.in_sweep() else None
 
-    @property
-    def _console(self) -> Console | None:
-        """Where progress shows: a sweep shows none of its runs."""
-        return Console(quiet=True) if config.in_sweep() else None
 
-    @property
-    def _of_experts(self) -> NamedValues:
-        """The settings that the run shares with its experts."""
-        return {key: value for key, value in config.plain(self.cfg).items() if key in OF_AN_EXPERT}
-
-    @property
-    def decides_experts(self) -> NamedValues:
-        """All that the numbers of the run's experts depend on, beside their curriculum."""
-        settings = self._of_experts
-        now = _code(self.curriculum, settings)
-        changed = {name: now[name] for name, as_ever in (("sources", {}), ("numbers", 1)) if now[name] != as_ever}
-        return {**as_before(settings), "versions": versions(), **changed}
-
-    def expert(self, alone: Curriculum, run_dir: Path, together: Sequence[int] = ()) -> tuple[Agent, RunDirectory]:
-        """Build an agent that learns a single task, as `new_agent` does, and prepare its directory."""
-        agent = new_agent(alone, self.make_alone, self.cfg.seed, self.device)
-        saved = self._checkpoints(run_dir)
-        return agent, RunDirectory(run_dir, self._of_experts, saved, together, console=self._console)
-
-    def learn_alone(self, alone: Curriculum, run_dirs: RunDirs) -> Failures:
-        """Let an agent learn a single task, or resume what was begun so; what a group has half learned begins again."""
-        agent, where = self.expert(alone, run_dirs[self.cfg.seed])
-        if is_of_group(where.run_dir) and where.checkpoints.newest_frames != alone.num_frames:
-            where.checkpoints.clear()
-        train_alone(alone, agent, where, self.cfg.seed, self.device)
-        return {}
-
-    def _experts(self) -> list[Expert]:
-        """Return the experts of the curriculum, found or trained with the run's own agent, seed and threads."""
-        folder = Path(self.cfg.experts_dir)
-        keys = {self.cfg.seed: self.decides_experts}
-        found, _ = find_or_train(self.curriculum, self.learn_alone, folder, keys, print, waiting=self.interrupt.check)
-        return found[self.cfg.seed]
-
-    def _checkpoints(self, run_dir: Path) -> Checkpoints:
-        strict = self.cfg.resume == "strict"
-        return Checkpoints(run_dir / CHECKPOINTS, self.cfg.checkpoint_seconds, strict, self.interrupt)
-
-    def _replaces(self, run_dir: Path) -> bool:
-        """Return whether a run of the directory is replaced and not resumed."""
-        if self.cfg.overwrite != config.STALE:
-            return bool(self.cfg.overwrite)
+def prepare(session: Session, cfg: DictConfig, member: RunMember) -> None:
+    """Open the tracker of a run, remove results that are replaced, and write the configuration."""
+    run_dir = member.run_dir
+    replaced = bool(cfg.overwrite)
+    if cfg.overwrite == config.STALE:
         about = first_line(run_dir)
-        return about is not None and bool(code_changes(about, _code(self.curriculum, config.plain(self.cfg))))
+        replaced = about is not None and bool(code_changes(about, member.about))
+    if "logger" in cfg:
+        settings = dict(flat(member.config))
+        member.listeners.append(session.enter(Tracker(config.target(cfg, "logger"), run_dir, settings)))
+    elif replaced:
+        shutil.rmtree(run_dir / FOLDER, ignore_errors=True)
+    if replaced:
+        member.checkpoints.clear()
+        remove_results(run_dir)
+    config.write_configuration(cfg, run_dir / ".hydra")
 
-    @contextmanager
-    def _tracking(self, run_dir: Path) -> Iterator[list[Tracker]]:
-        """Open the tracker that ``logger`` names, if it names one, and close it at the end."""
-        if "logger" not in self.cfg:
-            if self._replaces(run_dir):
-                shutil.rmtree(run_dir / FOLDER, ignore_errors=True)
-            yield []
-            return
-        settings = dict(flat(config.plain(self.cfg)))
-        with Tracker(config.target(self.cfg, "logger"), run_dir, settings) as tracker:
-            yield [tracker]
+
+def settings_of_experts(cfg: DictConfig) -> NamedValues:
+    """Return the settings that a run shares with its single-task experts."""
+    return {key: value for key, value in config.plain(cfg).items() if key in OF_AN_EXPERT}
+
+
+def train_experts(
+    configs: Sequence[Any], curriculum: Curriculum, interrupt: Interrupt, only: int | None = None
+) -> tuple[dict[int, list[Expert]], Failures]:
+    """Find or train the single-task experts of the runs of several seeds, those of a task as one batch.
+
+    Args:
+        configs: the configuration of each seed.
+        curriculum: what they learn.
+        interrupt: notices when the process is asked to stop.
+        only: the position of the one task whose experts are needed, from 1; None: all.
+
+    Returns:
+        The experts of each seed, and the error of each seed with an expert that failed, which then has none.
+    """
+    by_seed = {cfg.seed: cfg for cfg in configs}
+    first = configs[0]
+
+    def learn(alone: Curriculum, run_dirs: RunDirs, session: Session) -> Failures:
+        members = []
+        for seed, run_dir in run_dirs.items():
+            cfg = by_seed[seed]
+            make_alone = config.target(cfg, "agent")
+            settings = settings_of_experts(cfg)
+            members.append(make_member(cfg, run_dir, alone, make_alone, settings=settings, interrupt=interrupt))
+        if len(members) > 1 or is_of_group(members[0].run_dir):
+            for member in members:
+                member.together = [*run_dirs]
+        failed = session.learn(members, OneBatch(checked_device(first.device)))
+        return {members[number].seed: error for number, error in failed.items()}
+
+    deciding = {}
+    for seed, cfg in by_seed.items():
+        settings = settings_of_experts(cfg)
+        now = code(curriculum, learners(settings, None))
+        changes = {name: now[name] for name, as_ever in (("sources", {}), ("numbers", 1)) if now[name] != as_ever}
+        deciding[seed] = {**as_before(settings), "versions": versions(), **changes}
+    folder = Path(first.experts_dir)
+    with torch.random.fork_rng():
+        return find_or_train(
+            curriculum,
+            learn,
+            folder,
+            deciding,
+            print,
+            waiting=interrupt.check,
+            only=only,
+            console=console_of_runs(),
+        )
+
+
+def learn_experts(configs: Sequence[Any], task: int) -> None:
+    """Find or train the single-task experts of seeds for one task, from 1, as one batch.
+
+    Args:
+        configs: the configuration of each seed.
+        task: position of the task in the curriculum.
+    """
+    first = configs[0]
+    prepare_torch(first)
+    with Interrupt() as interrupt:
+        train_experts(configs, curriculum_of(first, method_of(first)()), interrupt, only=task)
 
 
 @takes_numbers
@@ -263,43 +276,161 @@ def prepare_torch(cfg: DictConfig) -> None:
     torch.set_flush_denormal(True)
 
 
-def run_job(cfg: DictConfig, run_dir: Path, job: Job | None = None) -> None:
+def run_job(cfg: DictConfig, run_dir: Path, built: RunMember | None = None) -> None:
     """Run a configuration in an existing directory, unless its results are there; a read-only one may hold them.
 
     Args:
         cfg: the composed configuration.
         run_dir: the directory.
-        job: its objects, if they were just built.
+        built: its objects, if they were just built.
 
     Raises:
         ValueError: before any work, for a value out of range.
         FileExistsError: if the directory holds results that ``overwrite`` does not allow to replace.
+        FloatingPointError: if a loss or weight is not finite.
     """
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     if (run_dir / METRICS).exists() and not is_writable(run_dir):  # no lock either: no process can write
         config.check_values(cfg)
         if is_finished(cfg, run_dir):
             return
-    with locked(run_dir):
+    with Session(console_of_runs()) as session:
+        session.lock(run_dir)
         with mark_failure(run_dir) if config.in_sweep() and not (run_dir / METRICS).exists() else nullcontext():
             config.check_values(cfg)
             finished = is_finished(cfg, run_dir)
         if finished:
             shutil.rmtree(run_dir / CHECKPOINTS, ignore_errors=True)  # if it was killed at its very end
             return
-        with Interrupt() if job is None else job.interrupt as interrupt, mark_failure(run_dir):
-            learn(cfg, run_dir, interrupt, job)
+        with Interrupt() if built is None else built.checkpoints.interrupt as interrupt, mark_failure(run_dir):
+            for error in learn(session, [(cfg, run_dir)], interrupt, built).values():
+                raise error
 
 
-def learn(cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None = None, job: Job | None = None) -> None:
-    """Build the objects of a configuration, unless they are given, and let them learn into a directory."""
-    if job is None:
-        job = Job.of(cfg, Interrupt() if interrupt is None else interrupt)
-    if cfg.experts and not job.curriculum.evaluation.every:
+def learn(
+    session: Session,
+    cells: Sequence[ConfigAndPath],
+    interrupt: Interrupt,
+    built: RunMember | None = None,
+    together: bool = False,
+) -> Failures:
+    """Build the objects of runs that differ in their seeds, and let them learn into their locked directories.
+
+    Args:
+        session: has the locks.
+        cells: one, or all that learn as one batch.
+        interrupt: notices when the process is asked to stop.
+        built: the objects of one of them, if they were just built.
+        together: whether they learn as one batch, which a single one may, too.
+
+    Returns:
+        The error of each seed that failed, itself or one of its single-task experts.
+    """
+    members: dict[int, RunMember] = {}
+    for cfg, run_dir in cells:
+        if built is not None and built.seed == cfg.seed:
+            members[cfg.seed] = built
+        else:
+            members[cfg.seed] = build(cfg, run_dir, interrupt)
+    first = cells[0][0]
+    curriculum = members[first.seed].curriculum
+    if first.experts and not curriculum.evaluation.every:
         print("note: forward transfer against experts needs evaluations within blocks: set evaluation.every")
-    for note in notes(job.curriculum):
+    for note in notes(curriculum):
         print(f"note: {note}")
-    job.learn(run_dir)
+    for cfg, _ in cells:
+        prepare(session, cfg, members[cfg.seed])
+    failed: Failures = {}
+    if first.experts:
+        experts, failed = train_experts([cfg for cfg, _ in cells], curriculum, interrupt)
+        members = {seed: members[seed] for seed in experts}
+        for seed, member in members.items():
+            member.experts = experts[seed]
+    if together:
+        for member in members.values():
+            member.together = [*members]
+    if members:
+        errors = session.learn([*members.values()], OneBatch(checked_device(first.device)))
+        for number, error in errors.items():
+            failed[[*members][number]] = error
+    return failed
+
+
+def run_as_one(cells: Sequence[ConfigAndPath], built: RunMember | None = None) -> None:
+    """Run those that are not finished, as one batch; a seed that fails stops no other.
+
+    Args:
+        cells: the configuration of each seed, and its existing directory.
+        built: the objects of one of them, if they were just built.
+
+    Raises:
+        RuntimeError: if seeds have failed.
+    """
+    failed: Failures = {}
+    with Session(console_of_runs()) as session:
+        for _, run_dir in cells:
+            session.lock(run_dir)
+        left = []
+        for cfg, run_dir in cells:
+            if is_finished(cfg, run_dir):
+                shutil.rmtree(run_dir / CHECKPOINTS, ignore_errors=True)  # if it was killed at its very end
+            else:
+                left.append((cfg, run_dir))
+        with ExitStack() as stack:
+            interrupt = stack.enter_context(Interrupt() if built is None else built.checkpoints.interrupt)
+            for _, run_dir in left:
+                stack.enter_context(mark_failure(run_dir))
+            if left:
+                failed = learn(session, left, interrupt, built, together=True)
+        for cfg, run_dir in left:
+            if cfg.seed in failed:
+                with suppress(FloatingPointError), mark_failure(run_dir):
+                    raise failed[cfg.seed]
+    if failed:
+        raise RuntimeError("; ".join(f"{type(error).__name__}: {error}" for error in failed.values()))
+
+
+def run_seeds(cfg: Any, run_dir: Path) -> list[Path]:
+    """Run a configuration with each of the ``seeds`` that a sweep lists, in its directory.
+
+    Args:
+        cfg: the composed configuration, with the first seed.
+        run_dir: its directory.
+
+    Returns:
+        The directories of all seeds.
+
+    Raises:
+        ValueError: before any work, for a value out of range.
+        RuntimeError: if seeds have failed.
+    """
+    alone = "seeds is a setting of the jobs of a sweep: add -m, and give seed=0,1 in place of it"
+    require((config.in_sweep(), alone))
+    seeds = cfg.seeds
+    are_seeds = isinstance(seeds, Sequence) and all(map(is_int, seeds)) and len({*seeds}) == len(seeds) > 0
+    rule = f"seeds must be a list of different seeds that begins with seed={cfg.seed}, got {seeds}"
+    require((are_seeds and seeds[0] == cfg.seed, rule))
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+    cells = [config.of_seed(cfg, seed, run_dir) for seed in seeds]
+    for each, folder in cells:
+        config.check_values(each)
+        folder.mkdir(parents=True, exist_ok=True)
+    first = build(*cells[0])
+    reason = why_not_together(first.curriculum) or why_agents_learn_alone(first.agent, checked_device(cfg.device))
+    if reason is None:
+        run_as_one(cells, first)
+        return [folder for _, folder in cells]
+    print(f"note: seeds are trained one after the other, as {terminal_text(reason)}", file=sys.stderr)
+    torch.set_rng_state(first.random)
+    errors = []
+    for number, (each, folder) in enumerate(cells):
+        try:
+            run_job(each, folder, None if number else first)
+        except Exception as error:  # one that fails stops no other
+            errors.append(f"seed {each.seed}: {type(error).__name__}: {config.explain(error)}")
+    if errors:
+        raise RuntimeError("; ".join(errors))
+    return [folder for _, folder in cells]
 
 
 def is_finished(cfg: DictConfig, run_dir: Path) -> bool:
@@ -352,12 +483,8 @@ def code_of(cfg: DictConfig, known: dict[str, NamedValues]) -> NamedValues:
     if key not in known:
         with suppress(Exception):  # of the code of a user; once imported it may find more modules
             config.target(cfg, "agent")
-        known[key] = _code(curriculum_of(cfg, method_of(cfg)()), settings)
+        known[key] = code(curriculum_of(cfg, method_of(cfg)()), learners(settings, None))
     return known[key]
-
-
-def _code(curriculum: Curriculum, settings: ReadOnlyValues) -> NamedValues:
-    return code(curriculum, learners(settings, None))
 
 
 def first_line(run_dir: Path) -> ReadOnlyValues | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import nullcontext
 from pathlib import Path
 from types import FunctionType
 from typing import Any
@@ -23,19 +23,19 @@ from ctgraph_rl.checks import (
     takes_numbers,
     true_or_false,
 )
-from ctgraph_rl.disk import is_writable, made_folder, sync_folders
+from ctgraph_rl.disk import is_writable, made_folder
 from ctgraph_rl.learn.adapt import adapt
 from ctgraph_rl.learn.collect import Policy, agent_specs
 from ctgraph_rl.learn.evaluate import Evaluator, by_slices
-from ctgraph_rl.log.files import CHECKPOINTS, LOG, METRICS, locked
-from ctgraph_rl.log.provenance import code_changes, provenance
+from ctgraph_rl.log.files import CHECKPOINTS, LOG, METRICS
+from ctgraph_rl.log.provenance import code_changes
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.log.sources import full_name
 from ctgraph_rl.runs.checkpoints import SECONDS, Checkpoints
+from ctgraph_rl.runs.session import RunMember, Session, is_whole
 from ctgraph_rl.runs.settings import differences, flat
 from ctgraph_rl.runs.trackers import FOLDER, Tracker, logger_of
-from ctgraph_rl.runs.train import is_whole, remove_results, resumed_log, write_curriculum, write_results
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 
@@ -151,32 +151,41 @@ class Recorder:
         self.finished = False
         self._evaluated = -1
         self._trained = 0
-        self._tracker: Tracker | None = None
-        self._lock: ExitStack | None = None  # of the directory, while this writes into it
-        names = None if code is None else [full_name(each) for each in code]
-        self._about = {**provenance(curriculum, names), "config": {"seed": seed, **(about or {})}}
+        self._session: Session | None = None  # while this writes into its directory
+        self._member = RunMember(
+            curriculum,
+            None,  # type: ignore[arg-type] # its user's
+            seed,
+            run_dir=Path() if self.run_dir is None else self.run_dir,
+            config={"seed": seed, **(about or {})},
+            checkpoints=Checkpoints(Path(self.run_dir or "", CHECKPOINTS), checkpoint_seconds),
+            sources=None if code is None else [full_name(each) for each in code],
+        )
         if self.run_dir is None:
-            self.log = RunLog()
-            self.log.append("run", **self._about)
+            self._member.log.append("run", **self._member.about)
         else:
             make_logger = logger_of(logger)
-            self._checkpoints = Checkpoints(self.run_dir / CHECKPOINTS, checkpoint_seconds)
             is_read_only = resume and (self.run_dir / METRICS).exists() and not is_writable(self.run_dir)
-            with ExitStack() as stack:
+            with Session() as session:
                 if not is_read_only:  # else no process can write
-                    stack.enter_context(locked(made_folder(self.run_dir)))
-                self.log = self._opened(self.run_dir, overwrite, resume)
+                    session.lock(made_folder(self.run_dir))
+                self._open(self.run_dir, overwrite, resume)
                 if not self.finished:
                     if make_logger is not None:
-                        self._tracker = Tracker(make_logger, self.run_dir, dict(flat(self._about["config"])))
-                        self.log.listeners.append(self._tracker)
-                    self._lock = stack.pop_all()
+                        tracker = Tracker(make_logger, self.run_dir, dict(flat(self._member.config)))
+                        self.log.listeners.append(session.enter(tracker))
+                    self._session = session.pop_all()
         self._evaluator = Evaluator(curriculum, seed, self.log)
 
-    def _opened(self, run_dir: Path, overwrite: bool, resume: bool) -> RunLog:
-        """Return the log of a run that begins, or of one that is resumed."""
+    @property
+    def log(self) -> RunLog:
+        """What was measured so far."""
+        return self._member.log
+
+    def _open(self, run_dir: Path, overwrite: bool, resume: bool) -> None:
+        """Open the log of a run that begins, of one that is resumed, or of one that is finished."""
         path = run_dir / LOG
-        begun = RunLog.begun(run_dir / LOG)
+        begun = RunLog.begun(path)
         stopped = begun is not None and not (run_dir / METRICS).exists()
         if not overwrite and not (resume and begun is not None) and path.exists() and not RunLog.is_blank(path):
             what = "a run that was stopped" if stopped else "no run" if begun is None else "a finished run"
@@ -185,50 +194,44 @@ class Recorder:
         if resume and begun is not None:
             self._check_same(begun)
             if not stopped and is_whole(run_dir):
-                return self._shown(run_dir)
-        self._checkpoints.tidy()
-        state = self._checkpoints.newest() if resume else None
+                self._show(run_dir)
+                return
+        checkpoints = self._member.checkpoints
+        checkpoints.tidy()
+        state = checkpoints.newest() if resume else None
         if state is not None:
-            require(("learner" in state, f"{self._checkpoints.folder} holds no checkpoint of a Recorder"))
+            require(("learner" in state, f"{checkpoints.folder} holds no checkpoint of a Recorder"))
             self.saved = state["learner"]
             self.frames = state["frames"]
             self._evaluated = state["evaluated"]
             self._trained = state["trained"]
-            return resumed_log(run_dir, state, self._about, self._checkpoints.strict)
-        self._checkpoints.clear()
-        if overwrite or stopped:
-            remove_results(run_dir)
-        if begun is not None:
-            shutil.rmtree(run_dir / FOLDER, ignore_errors=True)
-        path.unlink(missing_ok=True)
-        log = RunLog(path)
-        log.append("run", **self._about)
-        log.sync()
-        sync_folders(run_dir)
-        return log
+        else:
+            checkpoints.clear()
+            if begun is not None:
+                shutil.rmtree(run_dir / FOLDER, ignore_errors=True)
+        self._member.begin(state)
 
     def _check_same(self, begun: Mapping[str, Any]) -> None:
-        """Refuse to resume a run of another curriculum or of other settings; `resumed_log` knows of code."""
+        """Refuse to resume a run of another curriculum or of other settings; `begin` knows of code."""
         before = begun.get("fingerprint")
-        now = self._about["fingerprint"]
+        now = self.curriculum.fingerprint
         other = f"{self.run_dir} holds a run of {begun.get('curriculum')} (fingerprint {before}), this one has {now}"
-        changed = differences(begun.get("config") or {}, self._about["config"])
+        changed = differences(begun.get("config") or {}, self._member.config)
         fix = "give what it was begun with, choose another run_dir, or overwrite=True"
         require(
             (before == now, f"{other}: {fix}"),
             (not changed, f"{self.run_dir} holds a run with {', '.join(changed)}: {fix}"),
         )
 
-    def _shown(self, run_dir: Path) -> RunLog:
-        """Return the log of a finished run, which nothing is added to."""
-        log = RunLog.read(run_dir / LOG)
-        changed = ", ".join(code_changes(log.of_kind("run")[0], self._about))
+    def _show(self, run_dir: Path) -> None:
+        """Read the log of a finished run, which nothing is added to."""
+        self._member.log = RunLog.read(run_dir / LOG)
+        changed = ", ".join(code_changes(self.log.of_kind("run")[0], self._member.about))
         fix = "choose another run_dir, or overwrite=True to run it again"
         require((not changed, f"{run_dir} was made by other code: {changed} changed; {fix}"))
         self.finished = True
         self.frames = self._evaluated = self._trained = self.curriculum.num_frames
         print(f"{run_dir} holds this run, finished: its results are shown; overwrite=True runs it again")
-        return log
 
     @takes_numbers
     def checkpoint(self, state: Callable[[], Mapping[str, Any]], frames: int) -> None:
@@ -263,7 +266,7 @@ class Recorder:
             return {**reached, "learner": dict(state()), "log": self.log.position()}
 
         if not self.finished:
-            self._checkpoints.offer(make, self.curriculum.is_end(frames))
+            self._member.checkpoints.offer(make, self.curriculum.is_end(frames))
         self.frames = frames
 
     @property
@@ -350,37 +353,22 @@ class Recorder:
 
         A run without the last evaluation of the protocol is not finished: it gets no results and keeps its checkpoints.
         """
-        try:
-            self._end()
-            if self.run_dir is not None and self._lock is not None:
-                self._write_results(self.run_dir)
-        finally:
-            self._release()
-
-    def _write_results(self, run_dir: Path) -> None:
-        last = self.moments[-1]
-        if self._evaluated < last:
-            print(f"{run_dir} is not finished: it needs the evaluation after {last:,} frames; resume=True resumes it")
-            return
-        write_curriculum(self.curriculum, run_dir)
-        write_results(self.log, self.curriculum, run_dir)
-        self._checkpoints.clear()
-
-    def _end(self) -> None:
-        """Close the log and the logger."""
-        self.log.close()
-        if self._tracker is not None:
-            self._tracker.close()
-
-    def _release(self) -> None:
-        """Let other writers into the directory."""
-        if self._lock is not None:
-            self._lock.close()
-            self._lock = None
+        session = self._session
+        self._session = None
+        with session or nullcontext():
+            last = self.moments[-1]
+            if session is None:
+                self.log.close()
+            elif self._evaluated < last:
+                self.log.close()
+                unfinished = f"{self.run_dir} is not finished: it needs the evaluation after {last:,} frames"
+                print(f"{unfinished}; resume=True resumes it")
+            else:
+                self._member.finish()
 
     def _open_rule(self) -> Rule:
         """Return the rule that this is not closed: another writer may be in its directory."""
-        is_open = self.run_dir is None or self.finished or self._lock is not None
+        is_open = self.run_dir is None or self.finished or self._session is not None
         return is_open, f"this Recorder of {self.run_dir} is closed: a Recorder with resume=True resumes its run"
 
     def __getstate__(self) -> NamedValues:
@@ -396,10 +384,10 @@ class Recorder:
         if error is None:
             self.close()
             return
-        try:
-            self._end()
-        finally:
-            self._release()
+        session = self._session
+        self._session = None
+        with session or nullcontext():
+            self.log.close()
 
     def _adapted(self, policy: Any, policy_for: Callable[[int], Any] | None, frames: int) -> Policy:
         ids = self.curriculum.task_ids

@@ -8,18 +8,17 @@ import socket
 import threading
 import time
 from collections import Counter
-from collections.abc import Hashable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Hashable, Mapping
+from contextlib import suppress
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from ctgraph_rl.disk import read_regular, read_text, write_whole
+from ctgraph_rl.disk import read_regular, read_text
 from ctgraph_rl.learn.progress import TextBar
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CHECKPOINTS, FAILURE, LOCK, LOG, METRICS, MOST_BYTES_OF_A_REASON
 from ctgraph_rl.log.sums import MOST_BYTES_OF_SUMS, SUMS, is_complete
-from ctgraph_rl.runs import config
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -68,21 +67,6 @@ NOTHING = RunOutcome()
 def holds_results(folder: Path) -> bool:
     """Return whether a run directory holds results or a checkpoint, which a change of code would make stale."""
     return (folder / METRICS).exists() or any((folder / CHECKPOINTS).glob("*.pt"))
-
-
-@contextmanager
-def mark_failure(run_dir: Path) -> Iterator[None]:
-    """Leave the reason in ``failed.txt`` where a run that began or failed before, or a cell, ends by an error."""
-    mark = run_dir / FAILURE
-    failed_before = mark.exists()
-    mark.unlink(missing_ok=True)
-    try:
-        yield
-    except Exception as error:
-        if failed_before or (run_dir / LOG).exists() or config.in_sweep():
-            with suppress(OSError):
-                write_whole(mark, f"{type(error).__name__}: {config.explain(error)}\n", synced=False)
-        raise
 
 
 def _identity(path: Path) -> Hashable:

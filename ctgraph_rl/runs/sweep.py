@@ -371,8 +371,6 @@ def sweepable(arguments: Sequence[str]) -> list[str]:
     Hydra composes what a sweep's cells have in common with the default of every group that is swept, and would refuse
     a setting that this default lacks.
     """
-    if not any(each == "-m" or (each.startswith("--m") and "--multirun".startswith(each)) for each in arguments):
-        return list(arguments)
     groups = "|".join(path.name for path in Path(conf_dir()).iterdir() if path.is_dir() and path.name != "hydra")
     setting = re.compile(rf"((?:{groups})\.[\w.]+)=(.+)")
     return [_as_choice(*match.groups()) if (match := setting.fullmatch(each)) else each for each in arguments]

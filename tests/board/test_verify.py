@@ -22,7 +22,7 @@ from ctgraph_rl.board.rerun import cells_of, draw, result_of
 from ctgraph_rl.board.rescore import Check
 from ctgraph_rl.board.submit import submit
 from ctgraph_rl.log.run_log import RunLog
-from ctgraph_rl.runs.train import write_results
+from ctgraph_rl.runs.session import write_results
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 ENTRY = """

@@ -18,9 +18,7 @@ import curricula
 from baselines.parts.catalogue import catalogue
 from ctgraph_rl.packages import conf_dir
 from ctgraph_rl.run import ERRORS
-from ctgraph_rl.runs import config
-from ctgraph_rl.runs.interrupt import Interrupt
-from ctgraph_rl.runs.job import Job
+from ctgraph_rl.runs import config, job
 
 SECONDS = 120
 """For one case; most take a hundredth of a second."""
@@ -81,13 +79,13 @@ def build(cfg: DictConfig) -> None:
         config.target(cfg, "logger")
     if "exchange" not in cfg:
         config.check_values(cfg)
-        Job.of(cfg, Interrupt())
+        job.build(cfg, Path())
         return
     exchange = config.target(cfg, "exchange")()
     members = [config.of_member(cfg, number, exchange.settings_of(number)) for number in range(exchange.num_members)]
     for each in members[:1]:
         config.check_values(each)
-        Job.of(each, Interrupt())
+        job.build(each, Path())
 
 
 def small(compose: Callable[..., DictConfig], file: str) -> DictConfig:

@@ -259,7 +259,7 @@ def test_a_finished_run_in_a_read_only_directory_is_shown(compose, tmp_path, mon
     def refused(*_, **__):
         raise OSError(errno.EROFS, "Read-only file system")
 
-    monkeypatch.setattr(job, "locked", refused)
+    monkeypatch.setattr(job.Session, "lock", refused)
     monkeypatch.setattr("os.access", lambda path, mode: False)
     job.run_job(cfg, tmp_path)
 

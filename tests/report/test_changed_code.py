@@ -81,7 +81,8 @@ def ran(mine, monkeypatch) -> list[int]:
     """The seeds of the cells that were run, with results that are made up."""
     seeds: list[int] = []
 
-    def learn(cfg, run_dir, interrupt, built=None):
+    def learn(session, cells, *_):
+        [(cfg, run_dir)] = cells
         seeds.append(cfg.seed)
         for path in (run_dir / "run.jsonl", run_dir / "metrics.json"):
             path.unlink(missing_ok=True)
@@ -93,6 +94,7 @@ def ran(mine, monkeypatch) -> list[int]:
             log.append("evaluation", **where, label="goal", held_out=False, return_mean=value, success_rate=value)
         log.close()
         write_metrics(run_dir / "metrics.json", metrics.summary(log.performance(), [(0,)]))
+        return {}
 
     monkeypatch.setattr(job, "learn", learn)
     return seeds
@@ -364,7 +366,7 @@ def test_an_own_agent_that_changed_gets_new_experts_and_ours_keeps_its_own(mine,
     def key(target: str) -> dict:
         cfg = compose("agent=reinforce", "curriculum=fo_b1_4tasks", "experts=true", f"agent._target_={target}")
         with pytest.raises(KeyboardInterrupt):
-            job.learn(cfg, mine.folder)
+            job.run_job(cfg, mine.folder)
         return keys[-1]
 
     ours, first = key("baselines.reinforce.Reinforce"), key("my_agent.MyAgent")

@@ -19,7 +19,8 @@ from ctgraph_rl.report.figures.gallery import Gallery
 from ctgraph_rl.report.figures.trees import Trees, draw_trees, task_trees
 from ctgraph_rl.report.page import write_report
 from ctgraph_rl.report.sections import evaluation_curve, over_seeds, sections, training_curve
-from ctgraph_rl.run import run, show
+from ctgraph_rl.run import run
+from ctgraph_rl.runner import show
 from ctgraph_rl.runs.load import Trained
 from ctgraph_rl.runs.read import find_runs
 

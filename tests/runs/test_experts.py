@@ -28,7 +28,7 @@ def curriculum(*blocks: Block, **changes) -> Curriculum:
 def write_result(trained: list):
     """Stands for learning: keeps what is learned and writes a result."""
 
-    def learn(alone, run_dirs):
+    def learn(alone, run_dirs, session):
         for run_dir in run_dirs.values():
             trained.append(alone)
             finish(run_dir)
@@ -94,13 +94,13 @@ def test_another_seed_evaluation_or_budget_is_another_expert(tmp_path, change):
 def test_an_expert_that_was_stopped_is_gone_on_with(tmp_path):
     begun = []
 
-    def stop(alone, run_dirs):
+    def stop(alone, run_dirs, session):
         [run_dir] = run_dirs.values()
         begun.append(run_dir)
         (run_dir / "run.jsonl").write_text("half")
         raise KeyboardInterrupt
 
-    def go_on(alone, run_dirs):
+    def go_on(alone, run_dirs, session):
         [run_dir] = run_dirs.values()
         assert (run_dir / "run.jsonl").read_text() == "half"
         (run_dir / "metrics.json").write_text("{}")
@@ -171,7 +171,7 @@ def test_an_expert_is_kept_by_agent_seed_device_threads_and_versions(compose, mo
     monkeypatch.setattr(job, "find_or_train", find)
     cfg = compose("agent=dqn", "agent.gamma=0.5", "seed=3", "experts=true")
     with pytest.raises(KeyboardInterrupt):
-        job.learn(cfg, tmp_path)
+        job.run_job(cfg, tmp_path)
 
     agent = {**asked[0][3].pop("agent")}
     assert (agent["_target_"], agent["gamma"]) == (cfg.agent._target_, 0.5)

@@ -16,7 +16,7 @@ import pytest
 from helpers.kill_runs import unlike
 from helpers.sweeping import sweep
 
-from ctgraph_rl.runs import train
+from ctgraph_rl.runs import session
 from ctgraph_rl.runs.experts import begun_with
 
 pytestmark = pytest.mark.slow
@@ -70,21 +70,22 @@ def here(tmp_path, monkeypatch) -> Iterator[None]:
 
 @contextmanager
 def death_at(name: str, write: int) -> Iterator[None]:
-    """Death before a write, counted from the first call of a function of `train` until that returns."""
-    original = getattr(train, name)
+    """Death before a write, counted from the first call of a function of `session` until that returns."""
+    module = session if hasattr(session, name) else session.Session
+    original = getattr(module, name)
 
     def armed(*given: Any, **how: Any) -> Any:
-        setattr(train, name, original)
+        setattr(module, name, original)
         DEATH.left = write
         found = original(*given, **how)
         DEATH.left = None
         return found
 
-    setattr(train, name, armed)
+    setattr(module, name, armed)
     try:
         yield
     finally:
-        setattr(train, name, original)
+        setattr(module, name, original)
         DEATH.left = None
 
 
@@ -142,14 +143,14 @@ def test_a_group_that_is_killed_at_any_write_of_its_end_ends_as_one_group(monkey
     settings = ("seed=0,1", *PPO)
     assert sweep(monkeypatch, *settings, "hydra.sweep.dir=whole") == 0
     with monkeypatch.context() as patch:
-        patch.setattr(train.RunDirectory, "finish", lambda *_: DEATH.fail())
+        patch.setattr(session.RunMember, "finish", lambda *_: DEATH.fail())
         with pytest.raises(Killed):
             sweep(monkeypatch, *settings)
     Path("runs").rename("ended")
 
     write = 1
     shutil.copytree("ended", "runs")
-    while killed(monkeypatch, "execute", write, *settings):
+    while killed(monkeypatch, "learn", write, *settings):
         assert sweep(monkeypatch, *settings) == 0
         assert_whole("whole", [0, 1])
         shutil.rmtree("runs")

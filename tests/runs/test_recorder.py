@@ -13,10 +13,10 @@ import torch
 from helpers.scripted import DECISION_ID, ONE, TWO, Scripted, curriculum, decide
 
 from ctgraph_rl import Block, Evaluation, RunLog, learn_curriculum
+from ctgraph_rl.log.sums import RESULTS
 from ctgraph_rl.runs.read import read_run
 from ctgraph_rl.runs.recorder import Recorder
 from ctgraph_rl.runs.trackers import csv_logger
-from ctgraph_rl.runs.train import RESULTS
 
 TASKS = curriculum(Block(ONE, 12), Block(TWO, 24))
 
@@ -179,7 +179,8 @@ def test_a_directory_with_a_run_is_resumed_or_replaced_only_as_it_is_said(tmp_pa
 def test_overwrite_replaces_a_finished_run(tmp_path):
     for _ in range(2):
         with Recorder(TASKS, tmp_path, overwrite=True) as recorder:
-            assert [recorder.saved, {path.name for path in tmp_path.iterdir()}] == [None, {".lock", "run.jsonl"}]
+            assert recorder.saved is None
+            assert {path.name for path in tmp_path.iterdir()} == {".lock", "run.jsonl", "curriculum.json"}
             Learner().learn(recorder)
 
     with pytest.raises(FileExistsError, match=r"is of a finished run: .*, or overwrite=True .*, or resume=True"):
@@ -329,4 +330,4 @@ def test_an_error_in_the_users_loop_leaves_an_unfinished_run(tmp_path):
     with pytest.raises(RuntimeError), Recorder(TASKS, tmp_path):
         raise RuntimeError("the user's own")
 
-    assert [path.name for path in tmp_path.iterdir()] == ["run.jsonl"]
+    assert {path.name for path in tmp_path.iterdir()} == {"run.jsonl", "curriculum.json"}

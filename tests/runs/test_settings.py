@@ -162,7 +162,7 @@ def test_a_stored_agent_without_a_setting_that_was_added_is_loaded(tmp_path, mon
     from baselines import a2c
 
     small = ("agent.num_envs=8", "agent.num_steps=4", "agent.hidden_size=4")
-    job.learn(compose(*SHORT, "agent=a2c", *small), tmp_path)
+    job.run_job(compose(*SHORT, "agent=a2c", *small), tmp_path)
     original = a2c.A2C.__init__
 
     class Later(a2c.A2C):

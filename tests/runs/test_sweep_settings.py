@@ -12,7 +12,7 @@ from helpers.sweeping import UNLUCKY, command_line, configs, sweep
 
 from ctgraph_rl import run as run_module
 from ctgraph_rl.packages import conf_dir
-from ctgraph_rl.runs import status
+from ctgraph_rl.runs import session
 from ctgraph_rl.runs.sweep import Sweeper, sweepable
 
 
@@ -56,8 +56,7 @@ def test_every_experiment_has_settings_that_the_sweeper_takes():
     assert {name: keys - taken for name, keys in given.items() if keys - taken} == {}
 
 
-@pytest.mark.parametrize("flag", ["-m", "--multi", "--multirun"])
-def test_settings_of_groups_become_choices_of_one_where_that_reads_the_same(flag):
+def test_settings_of_groups_become_choices_of_one_where_that_reads_the_same():
     as_they_are = [
         "seed=3",
         "agent.gamma=null",
@@ -70,14 +69,12 @@ def test_settings_of_groups_become_choices_of_one_where_that_reads_the_same(flag
         "other.num_envs=3",
     ]
 
-    assert sweepable([flag, "method.coeff=2.5", "method.heads='multi'", "agent.layers=[8, 8]", *as_they_are]) == [
-        flag,
+    assert sweepable(["method.coeff=2.5", "method.heads='multi'", "agent.layers=[8, 8]", *as_they_are]) == [
         "method.coeff=choice(2.5)",
         "method.heads=choice('multi')",
         "agent.layers=choice([8, 8])",
         *as_they_are,
     ]
-    assert sweepable(["method.coeff=2.5"]) == ["method.coeff=2.5"]
 
 
 def test_a_setting_of_a_group_can_be_swept(learned, monkeypatch):
@@ -174,7 +171,7 @@ def test_one_cell_of_an_experiment_needs_no_m(learned, monkeypatch, prefix):
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
     words = ["ctgraph-rl", "experiment=masks_ct8", "method=ewc", f"{prefix}seed=3", "together=false"]
     monkeypatch.setattr(sys, "argv", words)
-    monkeypatch.setattr(run_module, "show", lambda *_: None)
+    monkeypatch.setattr("ctgraph_rl.runner.show", lambda *_: None)
 
     run_module.main()
 
@@ -227,10 +224,10 @@ def test_a_cell_that_cannot_be_started_again_stays_failed(learned, monkeypatch, 
 def test_a_mark_stays_where_a_run_alone_is_refused_again(monkeypatch, tmp_path):
     (tmp_path / "failed.txt").write_text("ValueError: before\n")
 
-    with pytest.raises(ValueError), status.mark_failure(tmp_path):
+    with pytest.raises(ValueError), session.mark_failure(tmp_path):
         raise ValueError("again")
     assert (tmp_path / "failed.txt").read_text() == "ValueError: again\n"
-    with status.mark_failure(tmp_path):
+    with session.mark_failure(tmp_path):
         pass
 
     assert not (tmp_path / "failed.txt").exists()

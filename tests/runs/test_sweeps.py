@@ -172,10 +172,12 @@ def test_overwrite_counts_what_a_machine_with_another_clock_has_run(learned, mon
     capsys.readouterr()
     learn = job.learn
 
-    def elsewhere(cfg, run_dir, interrupt, built=None):
-        learn(cfg, run_dir, interrupt)
+    def elsewhere(session, cells, *given):
+        [(cfg, run_dir)] = cells
+        failed = learn(session, cells, *given)
         there = time.time() + (3600 if cfg.seed == 0 else -3600)
         os.utime(run_dir / "metrics.json", (there, there))
+        return failed
 
     monkeypatch.setattr(job, "learn", elsewhere)
     code = sweep(monkeypatch, "seed=0,1", "overwrite=true")
@@ -194,7 +196,7 @@ def test_overwrite_counts_no_outcome_of_before(learned, monkeypatch, capsys):
 
 
 def test_a_sweep_that_is_interrupted_says_where_it_stands(learned, monkeypatch, capsys):
-    def stop(cfg, run_dir, interrupt, built):
+    def stop(*_):
         raise SystemExit(130)
 
     monkeypatch.setattr(job, "learn", stop)

@@ -11,6 +11,7 @@ import pytest
 import torch
 from helpers.kill_runs import equal
 from helpers.sweeping import command_line, sweep
+from omegaconf import DictConfig
 
 from baselines.update.seeds import SeedGroup
 from ctgraph_rl import RunLog, disk
@@ -19,14 +20,10 @@ from ctgraph_rl.log import run_log, sums, tables
 from ctgraph_rl.log.provenance import NUMBERS, NUMBERS_TOGETHER, code_changes
 from ctgraph_rl.report.page import write_report
 from ctgraph_rl.report.terminal import code_notes, group_size
-from ctgraph_rl.runs import checkpoints, config, train
-from ctgraph_rl.runs import seeds as runs_seeds
-from ctgraph_rl.runs.experts import find_or_train
-from ctgraph_rl.runs.interrupt import Interrupt
-from ctgraph_rl.runs.job import Job
+from ctgraph_rl.runs import checkpoints, config, job, session
+from ctgraph_rl.runs.job import learn_experts, run_as_one
 from ctgraph_rl.runs.load import load
 from ctgraph_rl.runs.read import find_runs, read_run
-from ctgraph_rl.runs.seeds import run_as_one, train_experts
 
 TINY = ("curriculum=ct2_interfering", "curriculum.num_frames=128", "evaluation.num_episodes=2", "agent.hidden_size=8")
 PPO = (*TINY, "agent=ppo", "agent.num_envs=8", "agent.num_steps=8", "agent.num_epochs=1")
@@ -68,7 +65,7 @@ def same(one: Path, other: Path) -> bool:
     return lines == its_lines and equal(weights, its_weights)
 
 
-def stop_after(monkeypatch, count: int, module=train, name="offer_all") -> None:
+def stop_after(monkeypatch, count: int, module=session, name="offer_all") -> None:
     """Let the process be killed after some checkpoints of a group."""
     calls, original = [], getattr(module, name)
 
@@ -130,7 +127,7 @@ def test_a_stopped_group_is_resumed_as_a_group_bit_by_bit_and_not_otherwise(
         assert sweep(monkeypatch, SEEDS, *settings, "hydra.sweep.dir=whole") == 0
     whole = runs("whole" if method != "finetune" else str(together))
     between_saves = (4, checkpoints.Checkpoints, "save")
-    between_results = (1, train.RunDirectory, "finish")
+    between_results = (1, session.RunMember, "finish")
 
     with monkeypatch.context() as patch:
         stop_after(patch, 3)
@@ -206,17 +203,17 @@ def test_a_group_that_meets_a_full_disk_at_a_file_of_its_results_is_resumed_bit_
             raise OSError(errno.ENOSPC, "No space left on device")
         disk.write_whole(path, content, synced)
 
-    finish = train.RunDirectory.finish
+    finish = session.RunMember.finish
     for full_at, again in ((1, "together=true"), (6, "together=true"), (7, "together=false"), (12, "together=true")):
         written.clear()
         with monkeypatch.context() as patch:
 
-            def finish_on_a_full_disk(directory, *given, patch=patch):
-                for module in (train, run_log, tables, sums):
+            def finish_on_a_full_disk(member, patch=patch):
+                for module in (session, run_log, tables, sums):
                     patch.setattr(module, "write_whole", write)
-                finish(directory, *given)
+                finish(member)
 
-            patch.setattr(train.RunDirectory, "finish", finish_on_a_full_disk)
+            patch.setattr(session.RunMember, "finish", finish_on_a_full_disk)
             assert sweep(patch, *settings, "together=true", f"hydra.sweep.dir=full{full_at}") == 1
 
         assert sweep(monkeypatch, *settings, again, f"hydra.sweep.dir=full{full_at}") == 0, written
@@ -257,7 +254,7 @@ def test_seeds_that_cannot_be_one_batch_are_run_as_alone_one_after_the_other(mon
         if cfg.seed == 0:
             raise FloatingPointError("the loss is NaN")
 
-    monkeypatch.setattr(runs_seeds, "run_job", run_job)
+    monkeypatch.setattr(job, "run_job", run_job)
     code = sweep(monkeypatch, "seed=0,1", *TINY, "agent=lstm_ppo", "agent.num_envs=8", "together=true")
 
     said = capsys.readouterr()
@@ -315,7 +312,7 @@ def test_a_seed_that_failed_has_failed_also_where_its_group_was_stopped_before_i
 
     with monkeypatch.context() as patch:
         patch.setattr(SeedGroup, "start_task", spoiled)
-        stop_after(patch, finished, train.RunDirectory, "finish")
+        stop_after(patch, finished, session.RunMember, "finish")
         assert sweep(patch, *settings) == 130
     capsys.readouterr()
 
@@ -349,34 +346,28 @@ def test_other_uses_are_refused(monkeypatch, capsys, arguments, message):
 def test_as_many_jobs_are_built_as_there_are_seeds(monkeypatch, settings):
     built = []
 
-    def stop_before_learning(job, *given):
-        built.append(job.cfg.seed)
+    def stop_before_learning(*_):
         raise RuntimeError("enough")
 
-    monkeypatch.setattr(Job, "prepared", stop_before_learning)
-    of = Job.of
-    monkeypatch.setattr(Job, "of", lambda *given: made.append(given[0].seed) or of(*given))
-    made: list[int] = []
+    monkeypatch.setattr(job, "prepare", stop_before_learning)
+    build = job.build
+    monkeypatch.setattr(job, "build", lambda *given: built.append(given[0].seed) or build(*given))
 
     assert sweep(monkeypatch, SEEDS, *PPO, *settings) == 1
 
-    assert made == [0, 1, 2]
+    assert built == [0, 1, 2]
 
 
-def jobs(*seeds: int, folder: str = "experts") -> list[Job]:
-    """Runs of one task, whose experts are trained in turn."""
-    made = []
-    for seed in seeds:
-        cfg = config.composed([*EXPERTS, f"seed={seed}", f"experts_dir={folder}"])
-        made.append(Job.of(cfg, Interrupt()))
-    return made
+def configs(*seeds: int, folder: str = "experts") -> list[DictConfig]:
+    """Runs of two tasks, whose experts are trained in turn."""
+    return [config.composed([*EXPERTS, f"seed={seed}", f"experts_dir={folder}"]) for seed in seeds]
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> list[Path]:
     """The experts of the first task, trained as a group without a stop."""
     folder = tmp_path_factory.mktemp("whole")
-    train_experts(jobs(0, 1, 2, folder=str(folder)), only=1)
+    learn_experts(configs(0, 1, 2, folder=str(folder)), 1)
     return experts(str(folder))
 
 
@@ -387,7 +378,8 @@ def groups(folder: str = "experts") -> list[list[int] | None]:
 @pytest.mark.slow
 def test_experts_of_a_group_are_trained_as_a_group_like_those_alone_up_to_rounding(monkeypatch):
     assert sweep(monkeypatch, "seed=0,1", "together=true", *EXPERTS) == 0
-    train_experts(jobs(0))
+    for task in (1, 2):
+        learn_experts(configs(0), task)
 
     assert groups("runs/experts") == 4 * [[0, 1]] and groups() == [None, None]
     for one, other in zip(experts("runs/experts")[::2], experts("experts"), strict=True):
@@ -406,15 +398,15 @@ def test_experts_of_a_group_are_trained_as_a_group_like_those_alone_up_to_roundi
 
 @pytest.mark.slow
 def test_stopped_experts_of_a_group_are_resumed_as_a_group_bit_by_bit(monkeypatch, whole):
-    finish = (train.RunDirectory, "finish", 1)
-    places = ((train, "offer_all", 2), (checkpoints.Checkpoints, "save", 2), finish, finish)
+    finish = (session.RunMember, "finish", 1)
+    places = ((session, "offer_all", 2), (checkpoints.Checkpoints, "save", 2), finish, finish)
 
     for module, name, count in places:
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
             stop_after(patch, count, module, name)
-            train_experts(jobs(0, 1, 2), only=1)
+            learn_experts(configs(0, 1, 2), 1)
     assert [(expert / "metrics.json").exists() for expert in experts("experts")] == [True, True, False]
-    train_experts(jobs(0, 1, 2), only=1)
+    learn_experts(configs(0, 1, 2), 1)
 
     assert all((expert / "restarts.jsonl").exists() for expert in experts("experts"))
     assert all(same(one, other) for one, other in zip(experts("experts"), whole, strict=True))
@@ -424,12 +416,11 @@ def test_stopped_experts_of_a_group_are_resumed_as_a_group_bit_by_bit(monkeypatc
 def test_experts_of_a_stopped_group_begin_again_where_one_is_needed_alone(monkeypatch):
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         stop_after(patch, 1)
-        train_experts(jobs(0, 1, 2), only=1)
-    [alone] = jobs(1)
-    find_or_train(alone.curriculum, alone.learn_alone, Path("experts"), {1: alone.decides_experts}, print, only=1)
+        learn_experts(configs(0, 1, 2), 1)
+    learn_experts(configs(1), 1)
 
     assert groups() == [[0, 1, 2], None, [0, 1, 2]]
-    train_experts(jobs(0, 1, 2), only=1)
+    learn_experts(configs(0, 1, 2), 1)
     assert groups() == [[0, 2], None, [0, 2]]
 
 
@@ -444,7 +435,7 @@ def test_an_expert_that_fails_fails_alone_and_its_run_does_not_begin(monkeypatch
             group.learners[1].weights[0].data.fill_(torch.nan)
 
     def run() -> None:
-        made = [(job.cfg, Path(f"seed{job.cfg.seed}")) for job in jobs(0, 1, 2)]
+        made = [(cfg, Path(f"seed{cfg.seed}")) for cfg in configs(0, 1, 2)]
         for _, folder in made:
             folder.mkdir(exist_ok=True)
         run_as_one(made)
@@ -467,8 +458,8 @@ def test_an_expert_that_fails_fails_alone_and_its_run_does_not_begin(monkeypatch
 
 def test_seeds_that_have_failed_are_an_error_of_the_group(tmp_path, monkeypatch):
     failed = {0: FloatingPointError("the loss is NaN"), 1: OSError("no disk")}
-    monkeypatch.setattr(runs_seeds, "is_finished", lambda cfg, run_dir: False)
-    monkeypatch.setattr(runs_seeds, "_marked", lambda left, built: failed)
+    monkeypatch.setattr(job, "is_finished", lambda cfg, run_dir: False)
+    monkeypatch.setattr(job, "learn", lambda *_, **__: failed)
 
     with pytest.raises(RuntimeError, match=r"^FloatingPointError: the loss is NaN; OSError: no disk$"):
-        run_as_one([({}, tmp_path)])
+        run_as_one([(config.composed([]), tmp_path)])

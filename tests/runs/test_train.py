@@ -43,7 +43,7 @@ def newest(run_dir: Path) -> Path:
 
 def about(monkeypatch, **changes) -> None:
     """Let the machine and versions of this process seem others."""
-    monkeypatch.setattr("ctgraph_rl.runs.train.provenance", lambda *given: {**provenance(*given), **changes})
+    monkeypatch.setattr("ctgraph_rl.runs.session.provenance", lambda *given: {**provenance(*given), **changes})
 
 
 def test_a_stopped_run_ends_as_if_never_stopped_and_leaves_no_checkpoint(stopped, whole):
@@ -85,7 +85,7 @@ def test_a_run_that_is_stopped_again_and_again_ends_the_same(stopped, whole):
 def test_a_run_that_is_stopped_while_its_results_are_written_ends_the_same(stopped, whole, monkeypatch, name):
     writes = {"agent.pt": "write_whole", "evaluations.csv": "write_tables", "performance.csv": "write_performance"}
     with monkeypatch.context() as patch:
-        patch.setattr(f"ctgraph_rl.runs.train.{writes.get(name, 'write_metrics')}", lambda *_, **__: 1 / 0)
+        patch.setattr(f"ctgraph_rl.runs.session.{writes.get(name, 'write_metrics')}", lambda *_, **__: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             learn_into(stopped)
     assert not (stopped / "metrics.json").exists()

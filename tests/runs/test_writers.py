@@ -22,9 +22,8 @@ from ctgraph_rl.collective.job import run_collective
 from ctgraph_rl.log.files import LOCK, locked
 from ctgraph_rl.profile import profile_page
 from ctgraph_rl.report.page import write_report
-from ctgraph_rl.runs.job import run_job
+from ctgraph_rl.runs.job import run_as_one, run_job
 from ctgraph_rl.runs.recorder import Recorder
-from ctgraph_rl.runs.seeds import run_as_one
 
 TASKS = curriculum(Block(ONE, 12))
 

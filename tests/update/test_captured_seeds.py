@@ -19,10 +19,10 @@ from ctgraph_rl import Block, RunLog
 from ctgraph_rl.core import philox
 from ctgraph_rl.learn import collect
 from ctgraph_rl.learn.stacked import learn_together
-from ctgraph_rl.runs import checkpoints, train
-from ctgraph_rl.runs import seeds as runs_seeds
+from ctgraph_rl.runs import checkpoints, job
+from ctgraph_rl.runs import session as runs_session
 from ctgraph_rl.runs.config import target
-from ctgraph_rl.runs.seeds import agents_together, why_agents_learn_alone
+from ctgraph_rl.runs.session import agents_together, why_agents_learn_alone
 from ctgraph_rl.runs.train import new_agent, with_method
 
 EIGHT = tuple(range(8))
@@ -302,7 +302,7 @@ def test_a_sweep_on_a_gpu_trains_seeds_with_memory_as_one_job_and_resumes_it_bit
         "why_agents_learn_alone": lambda agent, device: why_agents_learn_alone(agent, GPU),
     }
     for name, function in on_gpu.items():
-        monkeypatch.setattr(runs_seeds, name, function)
+        monkeypatch.setattr(job if name.startswith("why") else runs_session, name, function)
     monkeypatch.chdir(tmp_path)
     few = ("curriculum=ct2_interfering", "curriculum.num_frames=96", "evaluation.num_episodes=2")
     settings = ("seed=0,1", "together=true", "agent=lstm_ppo", *few, *TINY, *ONE_EPOCH)
@@ -316,7 +316,7 @@ def test_a_sweep_on_a_gpu_trains_seeds_with_memory_as_one_job_and_resumes_it_bit
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(train, "offer_all", stop)
+        patch.setattr(runs_session, "offer_all", stop)
         assert sweep(patch, *settings) == 130
     assert sweep(monkeypatch, *settings) == 0
 

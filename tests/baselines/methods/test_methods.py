@@ -144,7 +144,7 @@ def test_a_refused_pair_leaves_no_file(compose, tmp_path):
     cfg = compose("curriculum=fo_b1_4tasks", "agent=ppo", "method=mask_lc")
 
     with pytest.raises(ValueError, match="MaskLC needs task ids, which are hidden"):
-        job.learn(cfg, tmp_path)
+        job.run_job(cfg, tmp_path)
 
     assert list(tmp_path.iterdir()) == []
 

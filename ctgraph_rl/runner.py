@@ -1,0 +1,54 @@
+"""What a configuration runs: a single run, seeds as one batch, or a collective; then its results are shown."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+
+from ctgraph_rl.collective.job import run_collective
+from ctgraph_rl.log.escape import terminal_text
+from ctgraph_rl.log.files import list_members
+from ctgraph_rl.packages import makes_page
+from ctgraph_rl.report.objective import check_objective, objective_of
+from ctgraph_rl.report.style import require_packages
+from ctgraph_rl.report.terminal import print_summary
+from ctgraph_rl.runs.config import in_sweep
+from ctgraph_rl.runs.job import run_job, run_seeds
+
+
+def run_configuration(cfg: Any, run_dir: Path) -> float | None:
+    """Run a configuration in an existing directory, and show its results; see `ctgraph_rl.run.run`."""
+    if cfg.objective is not None:
+        check_objective(cfg.objective, cfg.experts)
+    if cfg.report:
+        require_packages()
+    if "exchange" in cfg:
+        run_collective(cfg, run_dir)
+        run_dirs = list_members(run_dir)
+    elif "seeds" in cfg:
+        run_dirs = run_seeds(cfg, run_dir)
+    else:
+        run_job(cfg, run_dir)
+        run_dirs = [run_dir]
+    if "exchange" not in cfg and (cfg.report or not in_sweep()):
+        for each in run_dirs:
+            show(each, cfg.report)
+    searches = not in_sweep() or HydraConfig.get().runtime.choices["hydra/sweeper"] != "cells"
+    return objective_of(cfg.objective, run_dirs) if cfg.objective is not None and searches else None
+
+
+def show(run_dir: Path, report: bool) -> None:
+    """Print the results of a finished run, and make its report or say how."""
+    print_summary(run_dir)
+    here = Path.cwd()
+    shown = run_dir.relative_to(here) if run_dir.is_relative_to(here) else run_dir
+    print(f"results: {terminal_text(shown)}")
+    if not report:
+        print(makes_page(f"report {shlex.quote(str(shown))}"))
+        return
+    from ctgraph_rl.report.page import write_report  # here: most runs make no page
+
+    print(f"report: {write_report([shown]).page}")
