@@ -11,14 +11,14 @@ is joined to the observation. Without context inputs it learns one policy for al
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
 from torch import Tensor
 from torch.func import functional_call
-from torchrl.data import Composite, TensorSpec
+from typing_extensions import override
 
 from baselines.parts.gates import GatedNetwork
-from baselines.parts.inner_loop import InnerLoop, InnerModel, NamedWeights, NetInputs
+from baselines.parts.inner_loop import InnerLoop, InnerLoopSettings, InnerModel, NamedWeights, NetInputs
 from ctgraph_rl.checks import is_int, require
 
 
@@ -46,23 +46,28 @@ class Context(InnerModel):
         return functional_call(self.net, theta, (*seen, context))
 
 
+@dataclass(frozen=True, kw_only=True)
+class CAVIASettings(InnerLoopSettings):
+    """The settings of `CAVIA`."""
+
+    num_context: int  # context inputs; 0: nothing adapts
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require((is_int(self.num_context, 0), f"num_context must be an integer >= 0, got {self.num_context!r}"))
+
+
 class CAVIA(InnerLoop):
-    """A policy of which a context adapts.
+    """A policy of which a context adapts; its settings are `CAVIASettings`."""
 
-    Args:
-        observation_spec: the environment's ``observation_spec_unbatched``.
-        action_spec: the environment's ``action_spec_unbatched``.
-        num_context: context inputs; 0: nothing adapts.
-        settings: the arguments of `InnerLoop`.
-    """
-
+    Settings = CAVIASettings
     solves = "tasks whose goal is drawn from several: it adapts a context after some episodes"
 
-    def __init__(self, observation_spec: Composite, action_spec: TensorSpec, num_context: int, **settings: Any) -> None:
-        require((is_int(num_context, 0), f"num_context must be an integer >= 0, got {num_context!r}"))
-        self.num_context = num_context
-        super().__init__(observation_spec, action_spec, **settings)
+    @property
+    def num_context(self) -> int:
+        """Inputs of the network beside observations."""
+        return self.settings.num_context
 
+    @override
     def make_model(self, net: GatedNetwork, inner_rate: float) -> InnerModel:
-        """See `InnerLoop`."""
         return Context(net, inner_rate, self.num_context)

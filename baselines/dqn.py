@@ -6,6 +6,7 @@ buffer; with priorities as Schaul et al. 2016 (arXiv 1511.05952) where configure
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -14,74 +15,62 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 from torchrl.modules import QValueActor
+from typing_extensions import override
 
 from baselines.cells.cell import linear_layer
-from baselines.parts.networks import Data, TensorsByName, num_actions_of, require_weights
-from baselines.parts.networks import encoder as make_encoder
-from baselines.parts.prioritized import LARGEST_ALPHA
-from baselines.parts.q_learning import QLearner, require_replay
-from ctgraph_rl.checks import at_least_one, at_most, fraction, not_negative, positive, require, true_or_false
+from baselines.parts.networks import Data, TensorsByName, encoder, num_actions_of, require_weights
+from baselines.parts.prioritized import LARGEST_ALPHA, PrioritySampler
+from baselines.parts.q_learning import QLearner, QLearnerSettings, require_replay
+from ctgraph_rl.checks import at_most, fraction, not_negative, require, true_or_false
+
+
+@dataclass(frozen=True, kw_only=True)
+class DQNSettings(QLearnerSettings):
+    """The settings of `DQN`.
+
+    Where different states show the same image, a one-step target is the same after every decision, so nothing is
+    learned about decisions: ``n_steps`` helps.
+    """
+
+    double: bool  # let the online network choose the action of the target (double Q-learning)
+    priority_alpha: float  # how strongly the TD error decides what is replayed; 0 is uniform
+    priority_beta: float  # how much of that the loss corrects, in [0, 1]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(
+            *true_or_false(double=self.double),
+            *fraction(priority_beta=self.priority_beta),
+            *not_negative(priority_alpha=self.priority_alpha),
+            *at_most(LARGEST_ALPHA, priority_alpha=self.priority_alpha),
+        )
 
 
 class DQN(QLearner):
-    """DQN for tasks that need no memory.
+    """DQN for tasks that need no memory; its settings are `DQNSettings`."""
 
-    Args:
-        observation_spec: the environment's ``observation_spec_unbatched``.
-        action_spec: the environment's ``action_spec_unbatched``.
-        hidden_size: width of the two hidden layers.
-        learning_rate: of Adam.
-        gamma: discount factor.
-        double: let the online network choose the action of the target (double Q-learning).
-        priority_alpha: how strongly the TD error decides what is replayed; 0 is uniform (Schaul et al. 2016, arXiv
-            1511.05952).
-        priority_beta: how much of that the loss corrects, in [0, 1].
-        encoder: ``mlp``, or ``cnn`` with two convolutions before the first layer, for images.
-        settings: the arguments of `QLearner`. Where different states show the same image, a one-step target is the
-            same after every decision, so nothing is learned about decisions: ``n_steps`` helps.
-    """
-
+    Settings = DQNSettings
     stackable = True
     solves = "fully observable tasks (CT-FO)"
 
-    def __init__(
-        self,
-        observation_spec: Composite,
-        action_spec: TensorSpec,
-        hidden_size: int,
-        learning_rate: float,
-        gamma: float,
-        double: bool,
-        priority_alpha: float,
-        priority_beta: float,
-        encoder: str = "mlp",
-        **settings: Any,
-    ) -> None:
-        require(
-            *at_least_one(hidden_size=hidden_size),
-            *positive(learning_rate=learning_rate),
-            *true_or_false(double=double),
-            *fraction(priority_beta=priority_beta),
-            *not_negative(priority_alpha=priority_alpha),
-            *at_most(LARGEST_ALPHA, priority_alpha=priority_alpha),
-        )
-        num_actions = num_actions_of(action_spec)
-        require_weights(observation_spec, hidden_size, 2, num_actions)
-        require_replay(observation_spec, settings["buffer_size"], settings["batch_size"])
-        self.priority_alpha = priority_alpha
-        self.priority_beta = priority_beta
-        self.gamma = gamma
-        super().__init__(gamma=gamma, **settings)
-        head = nn.Sequential(
-            linear_layer(hidden_size, hidden_size),
-            nn.ReLU(),
-            linear_layer(hidden_size, num_actions),
-        )
+    def __init__(self, observation_spec: Composite, action_spec: TensorSpec, **settings: Any) -> None:
+        super().__init__(observation_spec, action_spec, **settings)
+        width = self.settings.hidden_size
+        head = nn.Sequential(linear_layer(width, width), nn.ReLU(), linear_layer(width, num_actions_of(action_spec)))
         values = TensorDictModule(head, in_keys=["features"], out_keys=["action_value"])
-        features = make_encoder(observation_spec, hidden_size, kind=encoder)
+        features = encoder(observation_spec, width, kind=self.settings.encoder)
         greedy = QValueActor(TensorDictSequential(features, values), in_keys=features.in_keys, spec=action_spec)
-        self.is_double = double
-        self.set_networks(greedy, action_spec, learning_rate)
+        self.set_networks(greedy, action_spec)
+
+    @override
+    def require_room(self, observation_spec: Composite, num_actions: int) -> None:
+        require_weights(observation_spec, self.settings.hidden_size, 2, num_actions)
+        require_replay(observation_spec, self.settings.buffer_size, self.settings.batch_size)
+
+    @override
+    def make_sampler(self, size: int) -> Any:
+        alpha = self.settings.priority_alpha
+        return PrioritySampler(size, alpha, self.settings.priority_beta) if alpha else super().make_sampler(size)
 
     def experience(self, batch: TensorDictBase) -> TensorDictBase:
         """Return every step as a transition of up to ``n_steps`` steps."""
@@ -103,8 +92,8 @@ class DQN(QLearner):
         predicted = self.values(batch).gather(-1, batch["action"].unsqueeze(-1)).squeeze(-1)
         with torch.no_grad():
             later = self.with_others(others, type(self).values, after)
-            best = (self.values(after) if self.is_double else later).argmax(dim=-1, keepdim=True)
-            gamma = later.new_tensor(self.gamma) ** batch["steps_to_next_obs"].view_as(batch["next", "reward"])
+            best = (self.values(after) if self.settings.double else later).argmax(dim=-1, keepdim=True)
+            gamma = later.new_tensor(self.settings.gamma) ** batch["steps_to_next_obs"].view_as(batch["next", "reward"])
             running = (~batch["next", "terminated"]).int()
             target = (batch["next", "reward"] + gamma * running * later.gather(-1, best)).squeeze(-1)
         squared = (predicted - target).square()

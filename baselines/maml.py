@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from torch import Tensor
 from torch.func import functional_call
+from typing_extensions import override
 
 from baselines.parts.gates import GatedNetwork
 from baselines.parts.inner_loop import InnerLoop, InnerModel, NamedWeights, NetInputs
@@ -30,10 +31,10 @@ class AllWeights(InnerModel):
 
 
 class MAML(InnerLoop):
-    """A policy of which all weights adapt; the arguments are those of `InnerLoop`."""
+    """A policy of which all weights adapt; its settings are `InnerLoopSettings`."""
 
     solves = "tasks whose goal is drawn from several: it adapts all weights after some episodes"
 
+    @override
     def make_model(self, net: GatedNetwork, inner_rate: float) -> InnerModel:
-        """See `InnerLoop`."""
         return AllWeights(net, inner_rate)

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -31,6 +32,7 @@ from torch import Tensor, nn
 from torch.nn.functional import one_hot
 from torchrl.data import Composite, TensorSpec
 from torchrl.modules import EGreedyModule
+from typing_extensions import override
 
 from baselines.cells.cell import linear_layer
 from baselines.parts.networks import (
@@ -38,13 +40,13 @@ from baselines.parts.networks import (
     EncoderModule,
     Items,
     TensorsByName,
+    encoder,
     guided,
     is_greedy,
     num_actions_of,
     require_weights,
 )
-from baselines.parts.networks import encoder as make_encoder
-from baselines.parts.q_learning import QLearner, require_replay
+from baselines.parts.q_learning import QLearner, QLearnerSettings, require_replay
 from ctgraph_rl.checks import at_least_one, at_most, fraction, not_negative, positive, require, true_or_false
 
 STATE = ("eligibility", "average", "trial")
@@ -196,98 +198,84 @@ class ModulatedGreedy(TensorDictModuleBase):
         return self.noise_std * torch.randn_like(features) * (torch.rand_like(features) < self.noise_share)
 
 
+@dataclass(frozen=True, kw_only=True)
+class MOHQASettings(QLearnerSettings):
+    """The settings of `MOHQA`."""
+
+    num_features: int  # width of phi
+    predict_sum: bool  # predict q + u, as the targets do; False: only q, as published
+    eligibility_steps: float  # tau, over which eligibility falls to 1/e
+    hebbian_share: float  # share of the features, rounded up, whose eligibility rises, and of those whose falls
+    hebbian_change: float  # by how much
+    hebbian_decay: float  # by how much that of the other features falls
+    reward_baseline: float  # b, what is taken from the sign of a reward
+    average_decay: float  # d, of the running average of phi
+    noise_std: float  # standard deviation of the noise while acting
+    noise_share: float  # probability of a feature to get noise
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(
+            *at_least_one(num_features=self.num_features),
+            *positive(eligibility_steps=self.eligibility_steps),
+            *true_or_false(predict_sum=self.predict_sum),
+            *not_negative(hebbian_share=self.hebbian_share, hebbian_change=self.hebbian_change),
+            *not_negative(hebbian_decay=self.hebbian_decay),
+            *not_negative(reward_baseline=self.reward_baseline, noise_std=self.noise_std),
+            *fraction(average_decay=self.average_decay, noise_share=self.noise_share),
+            *at_most(0.5, hebbian_share=self.hebbian_share),
+        )
+
+
 class MOHQA(QLearner):
-    """A Q-network with a modulated Hebbian network beside it.
+    """A Q-network with a modulated Hebbian network beside it; its settings are `MOHQASettings`."""
 
-    Args:
-        observation_spec: the environment's ``observation_spec_unbatched``.
-        action_spec: the environment's ``action_spec_unbatched``.
-        hidden_size: width of the encoder.
-        num_features: width of phi.
-        learning_rate: of RMSprop.
-        gamma: discount factor.
-        predict_sum: predict q + u, as the targets do; False: only q, as published.
-        eligibility_steps: tau, over which eligibility falls to 1/e.
-        hebbian_share: share of the features, rounded up, whose eligibility rises, and share of those whose falls.
-        hebbian_change: by how much.
-        hebbian_decay: by how much that of the other features falls.
-        reward_baseline: b, what is taken from the sign of a reward.
-        average_decay: d, of the running average of phi.
-        noise_std: standard deviation of the noise while acting.
-        noise_share: probability of a feature to get noise.
-        encoder: ``mlp``, or ``cnn`` with two convolutions before the first layer, for images.
-        settings: the arguments of `QLearner`.
-    """
-
+    Settings = MOHQASettings
     solves = "fully observable tasks (CT-FO); its traces reach over waits that look alike"
 
     policy: ModulatedGreedy
     average: Tensor
     target_weights: Tensor
 
-    def __init__(
-        self,
-        observation_spec: Composite,
-        action_spec: TensorSpec,
-        hidden_size: int,
-        num_features: int,
-        learning_rate: float,
-        gamma: float,
-        predict_sum: bool,
-        eligibility_steps: float,
-        hebbian_share: float,
-        hebbian_change: float,
-        hebbian_decay: float,
-        reward_baseline: float,
-        average_decay: float,
-        noise_std: float,
-        noise_share: float,
-        encoder: str = "mlp",
-        **settings: Any,
-    ) -> None:
-        require(
-            *at_least_one(hidden_size=hidden_size, num_features=num_features),
-            *positive(learning_rate=learning_rate, eligibility_steps=eligibility_steps),
-            *true_or_false(predict_sum=predict_sum),
-            *not_negative(hebbian_share=hebbian_share, hebbian_change=hebbian_change, hebbian_decay=hebbian_decay),
-            *not_negative(reward_baseline=reward_baseline, noise_std=noise_std),
-            *fraction(average_decay=average_decay, noise_share=noise_share),
-            *at_most(0.5, hebbian_share=hebbian_share),
-        )
+    def __init__(self, observation_spec: Composite, action_spec: TensorSpec, **settings: Any) -> None:
+        super().__init__(observation_spec, action_spec, **settings)
+        given = self.settings
         num_actions = num_actions_of(action_spec)
-        require_weights(observation_spec, hidden_size, 1, num_features)
-        require_replay(observation_spec, settings["buffer_size"], settings["batch_size"], 2 * num_features)
-        super().__init__(gamma=gamma, **settings)
-        self.gamma = gamma
-        self.predict_sum = predict_sum
-        inner = make_encoder(observation_spec, hidden_size, kind=encoder)
-        projected = Projected(inner.module, hidden_size, num_features)
+        inner = encoder(observation_spec, given.hidden_size, kind=given.encoder)
+        projected = Projected(inner.module, given.hidden_size, given.num_features)
         trunk = EncoderModule(projected, in_keys=inner.in_keys, out_keys=["features"])
-        layers = nn.Sequential(nn.ReLU(), linear_layer(num_features, num_actions), nn.Sigmoid())
+        layers = nn.Sequential(nn.ReLU(), linear_layer(given.num_features, num_actions), nn.Sigmoid())
         head = TensorDictModule(layers, in_keys=["features"], out_keys=["action_value"])
         self.hebbian = HebbianHead(
-            num_features,
+            given.num_features,
             num_actions,
-            eligibility_steps=eligibility_steps,
-            hebbian_share=hebbian_share,
-            hebbian_change=hebbian_change,
-            hebbian_decay=hebbian_decay,
-            reward_baseline=reward_baseline,
+            eligibility_steps=given.eligibility_steps,
+            hebbian_share=given.hebbian_share,
+            hebbian_change=given.hebbian_change,
+            hebbian_decay=given.hebbian_decay,
+            reward_baseline=given.reward_baseline,
         )
         self.register_buffer("target_weights", self.hebbian.weights.clone())
-        self.register_buffer("average", torch.zeros(num_features, dtype=torch.float32, device="cpu"))
+        self.register_buffer("average", torch.zeros(given.num_features, dtype=torch.float32, device="cpu"))
         network = TensorDictSequential(trunk, head)
-        self.set_networks(network, action_spec, learning_rate)
+        self.set_networks(network, action_spec)
         self.policy = ModulatedGreedy(
             trunk,
             head,
             self.hebbian,
             self.exploration,
-            average_decay=average_decay,
-            noise_std=noise_std,
-            noise_share=noise_share,
+            average_decay=given.average_decay,
+            noise_std=given.noise_std,
+            noise_share=given.noise_share,
         )
-        self.optimiser = torch.optim.RMSprop(network.parameters(), learning_rate, alpha=RMSPROP_ALPHA, eps=RMSPROP_EPS)
+        rate = given.learning_rate
+        self.optimiser = torch.optim.RMSprop(network.parameters(), rate, alpha=RMSPROP_ALPHA, eps=RMSPROP_EPS)
+
+    @override
+    def require_room(self, observation_spec: Composite, num_actions: int) -> None:
+        given = self.settings
+        require_weights(observation_spec, given.hidden_size, 1, given.num_features)
+        require_replay(observation_spec, given.buffer_size, given.batch_size, 2 * given.num_features)
 
     def initial_state(self, num_envs: int) -> TensorDict:
         """Return no eligibility, and the mean average of the environments."""
@@ -337,11 +325,11 @@ class MOHQA(QLearner):
 
     def loss(self, batch: Data, others: Data | None = None) -> TensorsByName:
         """Compute the mean squared error of the value of the action taken; the targets are those of q' + u'."""
-        values = self.values(batch) if self.predict_sum else self.policy.head(self.policy.features(batch))
+        values = self.values(batch) if self.settings.predict_sum else self.policy.head(self.policy.features(batch))
         predicted = values.gather(-1, batch["action"].unsqueeze(-1))
         after = {key: batch["next", key] for key in (*self.policy.greedy.in_keys, "average")}
         with torch.no_grad():
             best = self.with_others(others, type(self).values, after).amax(dim=-1, keepdim=True)
-            gamma = best.new_tensor(self.gamma) ** batch["steps_to_next_obs"].view_as(best)
+            gamma = best.new_tensor(self.settings.gamma) ** batch["steps_to_next_obs"].view_as(best)
             target = batch["next", "reward"] + gamma * ~batch["next", "terminated"] * best
         return {"loss_value": (predicted - target).square().mean()}

@@ -24,7 +24,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from copy import deepcopy
+from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -39,7 +41,17 @@ from baselines.parts.learner import MOST_PASSES, Learner
 from baselines.parts.networks import Data, Items, TensorsByName, draw, entropy, guided, is_greedy, num_actions_of
 from baselines.parts.q_learning import require_replay
 from baselines.update.update import make_optimiser
-from ctgraph_rl.checks import NamedValues, at_least_one, at_most, fraction, not_negative, one_of, positive, require
+from ctgraph_rl.checks import (
+    NamedValues,
+    at_least_one,
+    at_most,
+    fraction,
+    make_fields_plain,
+    not_negative,
+    one_of,
+    positive,
+    require,
+)
 from ctgraph_rl.learn.collect import UNSTORED
 
 SMALLEST_VARIANCE = 1e-7
@@ -119,6 +131,47 @@ class PosteriorPolicy(TensorDictModuleBase):
         return tensordict.update(dict(zip(self.out_keys, written, strict=True)))
 
 
+@dataclass(frozen=True, kw_only=True)
+class PEARLSettings:
+    """The settings of `PEARL`."""
+
+    num_envs: int  # rows, each with one trial at a time
+    num_steps: int  # steps of each row between two rounds of updates
+    hidden_size: int  # width of all layers
+    num_layers: int  # layers before the output of each network
+    num_context: int  # width of z
+    trial_episodes: int  # episodes of a trial
+    learning_rate: float  # of Adam
+    gamma: float  # discount factor
+    entropy_coeff: float  # alpha
+    reward_scale: float  # what rewards are multiplied by in loss_value: against alpha and kl_coeff
+    kl_coeff: float  # weight of the divergence from N(0, 1)
+    buffer_size: int  # steps that replay keeps, of all rows
+    num_trials: int  # trials that a gradient step learns from
+    context_size: int  # steps of a trial that are its context there
+    batch_size: int  # steps of a trial that the critics and the policy learn from there
+    num_updates: int  # gradient steps after each batch of data
+    target_rate: float  # how far the target critics follow in each gradient step, in (0, 1]
+    max_grad_norm: float  # gradients are scaled down to this norm
+    gate: str  # modulates the layers of the policy, see `baselines.parts.gates`
+    gate_size: int  # units of a gate
+
+    def __post_init__(self) -> None:
+        make_fields_plain(self)
+        require(
+            *at_least_one(hidden_size=self.hidden_size, num_layers=self.num_layers, num_context=self.num_context),
+            *at_least_one(gate_size=self.gate_size, num_trials=self.num_trials, context_size=self.context_size),
+            *at_least_one(batch_size=self.batch_size, trial_episodes=self.trial_episodes),
+            *at_least_one(num_updates=self.num_updates),
+            *at_most(MOST_PASSES, num_updates=self.num_updates),
+            *positive(learning_rate=self.learning_rate, target_rate=self.target_rate),
+            *positive(reward_scale=self.reward_scale),
+            *fraction(gamma=self.gamma, target_rate=self.target_rate),
+            *not_negative(entropy_coeff=self.entropy_coeff, kl_coeff=self.kl_coeff),
+            *one_of(GATES, gate=self.gate),
+        )
+
+
 class PEARL(Learner):
     """Discrete soft actor-critic with a posterior over tasks.
 
@@ -128,28 +181,10 @@ class PEARL(Learner):
     Args:
         observation_spec: the environment's ``observation_spec_unbatched``.
         action_spec: the environment's ``action_spec_unbatched``.
-        num_envs: rows, each with one trial at a time.
-        num_steps: steps of each row between two rounds of updates.
-        hidden_size: width of all layers.
-        num_layers: layers before the output of each network.
-        num_context: width of z.
-        trial_episodes: episodes of a trial.
-        learning_rate: of Adam.
-        gamma: discount factor.
-        entropy_coeff: alpha.
-        reward_scale: what rewards are multiplied by in loss_value: against alpha and kl_coeff.
-        kl_coeff: weight of the divergence from N(0, 1).
-        buffer_size: steps that replay keeps, of all rows.
-        num_trials: trials that a gradient step learns from.
-        context_size: steps of a trial that are its context there.
-        batch_size: steps of a trial that the critics and the policy learn from there.
-        num_updates: gradient steps after each batch of data.
-        target_rate: how far the target critics follow in each gradient step, in (0, 1].
-        max_grad_norm: gradients are scaled down to this norm.
-        gate: modulates the layers of the policy, see `baselines.parts.gates`.
-        gate_size: units of a gate.
+        settings: the fields of `PEARLSettings`.
     """
 
+    Settings = PEARLSettings
     memory = True
     adapt_episodes = 1
     output_keys = ("log_probs",)
@@ -157,76 +192,33 @@ class PEARL(Learner):
 
     policy: PosteriorPolicy
 
-    def __init__(
-        self,
-        observation_spec: Composite,
-        action_spec: TensorSpec,
-        num_envs: int,
-        num_steps: int,
-        hidden_size: int,
-        num_layers: int,
-        num_context: int,
-        trial_episodes: int,
-        learning_rate: float,
-        gamma: float,
-        entropy_coeff: float,
-        reward_scale: float,
-        kl_coeff: float,
-        buffer_size: int,
-        num_trials: int,
-        context_size: int,
-        batch_size: int,
-        num_updates: int,
-        target_rate: float,
-        max_grad_norm: float,
-        gate: str,
-        gate_size: int,
-    ) -> None:
-        super().__init__(num_envs, num_steps, max_grad_norm)
-        require(
-            *at_least_one(
-                hidden_size=hidden_size,
-                num_layers=num_layers,
-                num_context=num_context,
-                gate_size=gate_size,
-                num_trials=num_trials,
-                context_size=context_size,
-                batch_size=batch_size,
-                trial_episodes=trial_episodes,
-                num_updates=num_updates,
-            ),
-            *at_most(MOST_PASSES, num_updates=num_updates),
-            *positive(learning_rate=learning_rate, target_rate=target_rate, reward_scale=reward_scale),
-            *fraction(gamma=gamma, target_rate=target_rate),
-            *not_negative(entropy_coeff=entropy_coeff, kl_coeff=kl_coeff),
-            *one_of(GATES, gate=gate),
-        )
+    def __init__(self, observation_spec: Composite, action_spec: TensorSpec, **settings: Any) -> None:
+        self.settings = given = PEARLSettings(**settings)
+        super().__init__(given.num_envs, given.num_steps, given.max_grad_norm)
         num_actions = num_actions_of(action_spec)
-        require_gated_weights(observation_spec, hidden_size, num_layers, num_context=num_context, gate_size=gate_size)
-        require_replay(observation_spec, buffer_size, num_trials * (batch_size + context_size), num_context)
-        short = f"buffer_size must be at least a step of each of num_envs={num_envs} rows, got {buffer_size}"
-        require((buffer_size >= num_envs, short))
-        self.gamma = gamma
-        self.entropy_coeff = entropy_coeff
-        self.reward_scale = reward_scale
-        self.kl_coeff = kl_coeff
-        self.target_rate = target_rate
-        self.kept_steps = buffer_size // num_envs
-        self.num_updates = num_updates
-        self.minibatch_size = num_trials
-        self.context_size = context_size
-        self.batch_size = batch_size
-        self.num_context = num_context
+        hidden = given.hidden_size, given.num_layers
+        context = given.num_context
+        require_gated_weights(observation_spec, *hidden, num_context=context, gate_size=given.gate_size)
+        items = given.num_trials * (given.batch_size + given.context_size)
+        require_replay(observation_spec, given.buffer_size, items, context)
+        short = f"buffer_size must be at least a step of each of num_envs={given.num_envs} rows"
+        require((given.buffer_size >= given.num_envs, f"{short}, got {given.buffer_size}"))
+        self.minibatch_size = given.num_trials
         self.specs = shown_specs(observation_spec)
         network = partial(
-            gated_network, self.specs, hidden_size=hidden_size, num_layers=num_layers, gate_size=gate_size
+            gated_network,
+            self.specs,
+            hidden_size=given.hidden_size,
+            num_layers=given.num_layers,
+            gate_size=given.gate_size,
         )
-        encoder = network(num_actions + 1, 2 * num_context, gate="none")
-        actor = network(num_context, num_actions, gate=gate)
-        self.policy = PosteriorPolicy(actor, encoder, list(self.specs), num_actions, trial_episodes)
-        self.critics = nn.ModuleList([network(num_context, num_actions, gate="none") for _ in range(2)])
+        encoder = network(num_actions + 1, 2 * context, gate="none")
+        actor = network(context, num_actions, gate=given.gate)
+        self.policy = PosteriorPolicy(actor, encoder, list(self.specs), num_actions, given.trial_episodes)
+        self.critics = nn.ModuleList([network(context, num_actions, gate="none") for _ in range(2)])
         self.targets = deepcopy(self.critics).requires_grad_(False)
-        self.optimiser = make_optimiser("adam", [*self.policy.parameters(), *self.critics.parameters()], learning_rate)
+        trained = [*self.policy.parameters(), *self.critics.parameters()]
+        self.optimiser = make_optimiser("adam", trained, given.learning_rate)
         self.replay: Items = {}
         """The last steps of all rows, [rows, steps] each, and whether a trial ``begins`` there."""
 
@@ -235,7 +227,7 @@ class PEARL(Learner):
         like = next(self.parameters()).detach()
         counts = like.new_zeros(num_envs, dtype=torch.int64)
         state = {"trial": counts.unsqueeze(-1), ACTION: counts, "reward": like.new_zeros(num_envs, 1)}
-        state |= {key: like.new_zeros(num_envs, self.num_context) for key in (PRECISION, WEIGHTED, CONTEXT)}
+        state |= {key: like.new_zeros(num_envs, self.settings.num_context) for key in (PRECISION, WEIGHTED, CONTEXT)}
         for key, spec in self.specs.items():
             state[f"{UNSTORED}{key}"] = torch.zeros(num_envs, *spec.shape, dtype=spec.dtype, device=like.device)
         return TensorDict(state, batch_size=[num_envs])
@@ -249,13 +241,17 @@ class PEARL(Learner):
         ends = begins.roll(-1, dims=1)
         ends[:, -1] = True
         last = torch.where(ends, place, num_steps).flip(1).cummin(dim=1).values.flip(1)
-        for _ in range(self.num_updates):
+        for _ in range(self.settings.num_updates):
             row = torch.randint(num_rows, (self.minibatch_size, 1), device=begins.device)
             step = torch.randint(num_steps, (self.minibatch_size, 1), device=begins.device)
             trial = row, first[row, step], last[row, step]
-            context = {("context", key): value for key, value in self._steps(*trial, self.context_size).items()}
-            noise = torch.randn(self.minibatch_size, self.num_context, dtype=torch.float32, device=begins.device)
-            yield {**self._steps(*trial, self.batch_size), **context, "noise": noise}
+            context = {
+                ("context", key): value for key, value in self._steps(*trial, self.settings.context_size).items()
+            }
+            noise = torch.randn(
+                self.minibatch_size, self.settings.num_context, dtype=torch.float32, device=begins.device
+            )
+            yield {**self._steps(*trial, self.settings.batch_size), **context, "noise": noise}
 
     def _store(self, batch: TensorDictBase) -> None:
         """Append a batch to the steps of each row, and drop the oldest ones."""
@@ -263,9 +259,10 @@ class PEARL(Learner):
         keys = [*self.specs, "action", ("next", "reward"), ("next", "terminated")]
         keys += [("next", key) for key in self.specs]
         kept = {}
+        kept_steps = self.settings.buffer_size // self.num_envs
         for key, value in {"begins": begins.squeeze(-1), **{key: batch[key] for key in keys}}.items():
             steps = [self.replay[key], value] if self.replay else [value]
-            kept[key] = torch.cat(steps, dim=1)[:, -self.kept_steps :].contiguous()
+            kept[key] = torch.cat(steps, dim=1)[:, -kept_steps:].contiguous()
         self.replay = kept
 
     def _steps(self, row: Tensor, first: Tensor, last: Tensor, number: int) -> Items:
@@ -287,18 +284,18 @@ class PEARL(Learner):
         after = tuple(batch["next", key] for key in self.specs)
         with torch.no_grad():
             later = self.policy.actor(*after, fixed).log_softmax(dim=-1)
-            soft = self.with_others(others, type(self).smaller, after, fixed) - self.entropy_coeff * later
+            soft = self.with_others(others, type(self).smaller, after, fixed) - self.settings.entropy_coeff * later
             value = (later.exp() * soft).sum(dim=-1, keepdim=True)
-            reward = self.reward_scale * batch["next", "reward"]
-            target = reward + self.gamma * ~batch["next", "terminated"] * value
+            reward = self.settings.reward_scale * batch["next", "reward"]
+            target = reward + self.settings.gamma * ~batch["next", "terminated"] * value
             best = self.smaller(seen, fixed)
         action = batch["action"].unsqueeze(-1)
         errors = [critic(*seen, context).gather(-1, action) - target for critic in self.critics]
         log_probs = self.policy.actor(*seen, fixed).log_softmax(dim=-1)
         return {
             "loss_value": sum(error.square().mean() for error in errors),
-            "loss_policy": (log_probs.exp() * (self.entropy_coeff * log_probs - best)).sum(dim=-1).mean(),
-            "loss_context": self.kl_coeff * kl_to_prior(mean, variance).mean(),
+            "loss_policy": (log_probs.exp() * (self.settings.entropy_coeff * log_probs - best)).sum(dim=-1).mean(),
+            "loss_context": self.settings.kl_coeff * kl_to_prior(mean, variance).mean(),
             "entropy": entropy(log_probs).detach().mean(),
         }
 
@@ -318,7 +315,7 @@ class PEARL(Learner):
     def after_update(self, measured: TensorsByName) -> TensorsByName:
         """Let the target critics follow."""
         for target, online in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
-            target.lerp_(online, self.target_rate)
+            target.lerp_(online, self.settings.target_rate)
         return measured
 
     def weights_changed(self) -> None:

@@ -28,8 +28,9 @@ that are of no use, and training measures it. An evaluation that samples plays t
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -43,7 +44,7 @@ from baselines.parts.distinct import distinct
 from baselines.parts.networks import Data, TensorsByName, guided, highest, is_greedy, num_actions_of, require_weights
 from baselines.update.measured import require_finite
 from baselines.update.update import minimise
-from ctgraph_rl.checks import NamedValues, TakesNumbers, at_least_one, fraction, positive, require, require_memory
+from ctgraph_rl.checks import NamedValues, at_least_one, fraction, make_fields_plain, positive, require, require_memory
 from ctgraph_rl.learn.collect import UNSTORED
 
 PASSES = 5
@@ -296,95 +297,84 @@ class Autoencoder(nn.Module):
         return pad(share.logit(1e-5).clamp(0, 1), (0, 1), value=1.0)[groups]
 
 
-class PennA(TakesNumbers, TensorDictModuleBase):
+@dataclass(frozen=True, kw_only=True)
+class PennASettings:
+    """The settings of `PennA`."""
+
+    num_envs: int  # rows, num_trials for each individual
+    num_steps: int  # steps of each row in a batch
+    num_batches: int  # batches of a life
+    num_trials: int  # trials of an individual, in rows that follow each other
+    life_episodes: int  # episodes of a trial whose rewards count
+    num_latents: int  # latents of the autoencoder
+    hidden_size: int  # units of its other layers
+    learning_rate: float  # of its gradient steps, which have momentum as published, not Adam
+    num_updates: int  # gradient steps after a generation
+    batch_size: int  # observations of each
+    segment_size: int  # individuals of which the best one has all children
+    crossover_prob: float  # probability of a child to be crossed with a random individual
+    insert_prob: float  # probability of a child to get a new neuron
+    duplicate_prob: float  # probability of a child to get a copy of a neuron
+    delete_prob: float  # probability of a child to lose a neuron
+    precision: float  # of mutations, see `mutation`
+
+    def __post_init__(self) -> None:
+        make_fields_plain(self)
+        require(
+            *at_least_one(num_envs=self.num_envs, num_steps=self.num_steps, num_batches=self.num_batches),
+            *at_least_one(num_trials=self.num_trials, life_episodes=self.life_episodes),
+            *at_least_one(num_latents=self.num_latents, hidden_size=self.hidden_size, num_updates=self.num_updates),
+            *at_least_one(batch_size=self.batch_size, segment_size=self.segment_size),
+            *fraction(crossover_prob=self.crossover_prob, insert_prob=self.insert_prob),
+            *fraction(duplicate_prob=self.duplicate_prob, delete_prob=self.delete_prob),
+            *positive(learning_rate=self.learning_rate, precision=self.precision),
+        )
+        rows = f"num_envs must be a multiple of num_trials={self.num_trials}, the rows of an individual"
+        require((self.num_envs % self.num_trials == 0, f"{rows}, got {self.num_envs}"))
+
+
+class PennA(TensorDictModuleBase):
     """A population that evolves. It is its own policy: each row has weights that last over the episodes of a life.
 
     Args:
         observation_spec: the environment's ``observation_spec_unbatched``.
         action_spec: the environment's ``action_spec_unbatched``.
-        num_envs: rows, ``num_trials`` for each individual.
-        num_steps: steps of each row in a batch.
-        num_batches: batches of a life.
-        num_trials: trials of an individual, in rows that follow each other.
-        life_episodes: episodes of a trial whose rewards count.
-        num_latents: latents of the autoencoder.
-        hidden_size: units of its other layers.
-        learning_rate: of its gradient steps, which have momentum as published, not Adam.
-        num_updates: gradient steps after a generation.
-        batch_size: observations of each.
-        segment_size: individuals of which the best one has all children.
-        crossover_prob: probability of a child to be crossed with a random individual.
-        insert_prob: probability of a child to get a new neuron.
-        duplicate_prob: probability of a child to get a copy of a neuron.
-        delete_prob: probability of a child to lose a neuron.
-        precision: of mutations, see `mutation`.
+        settings: the fields of `PennASettings`.
     """
 
+    Settings = PennASettings
     memory = True
     solves = "tasks whose goal changes within a life, if images show what was paid: it learns without a reward"
     in_keys = ["observation", "is_init", "trial", "life", WEIGHTS, OUTPUTS]  # noqa: RUF012, as TensorDict has it
     out_keys = ["action", *(("next", key) for key in in_keys[2:])]  # noqa: RUF012
 
-    def __init__(
-        self,
-        observation_spec: Composite,
-        action_spec: TensorSpec,
-        *,
-        num_envs: int,
-        num_steps: int,
-        num_batches: int,
-        num_trials: int,
-        life_episodes: int,
-        num_latents: int,
-        hidden_size: int,
-        learning_rate: float,
-        num_updates: int,
-        batch_size: int,
-        segment_size: int,
-        crossover_prob: float,
-        insert_prob: float,
-        duplicate_prob: float,
-        delete_prob: float,
-        precision: float,
-    ) -> None:
+    def __init__(self, observation_spec: Composite, action_spec: TensorSpec, **settings: Any) -> None:
         super().__init__()
+        self.settings = given = PennASettings(**settings)
         num_actions = num_actions_of(action_spec)
-        require(
-            *at_least_one(num_envs=num_envs, num_steps=num_steps, num_batches=num_batches, num_trials=num_trials),
-            *at_least_one(life_episodes=life_episodes, num_latents=num_latents, hidden_size=hidden_size),
-            *at_least_one(num_updates=num_updates, batch_size=batch_size, segment_size=segment_size),
-            *fraction(crossover_prob=crossover_prob, insert_prob=insert_prob),
-            *fraction(duplicate_prob=duplicate_prob, delete_prob=delete_prob),
-            *positive(learning_rate=learning_rate, precision=precision),
-            (num_actions == 3, f"PENN-A has one neuron for the actions 0, 1 and 2, and the task has {num_actions}"),
-        )
-        rows = f"num_envs must be a multiple of num_trials={num_trials}, the rows of an individual, got {num_envs}"
-        require((num_envs % num_trials == 0, rows))
-        require_weights(observation_spec, hidden_size, 2, num_latents)
-        weights = num_envs * (num_latents + len(NEURONS)) * len(NEURONS)
-        require_memory(f"weights of num_envs={num_envs} with num_latents={num_latents}", 16 * weights, "of either")
+        three = f"PENN-A has one neuron for the actions 0, 1 and 2, and the task has {num_actions}"
+        require((num_actions == 3, three))
+        require_weights(observation_spec, given.hidden_size, 2, given.num_latents)
+        weights = given.num_envs * (given.num_latents + len(NEURONS)) * len(NEURONS)
+        what = f"weights of num_envs={given.num_envs} with num_latents={given.num_latents}"
+        require_memory(what, 16 * weights, "of either")
         self.reproduction = Reproduction(
-            segment_size=segment_size,
-            crossover_prob=crossover_prob,
-            insert_prob=insert_prob,
-            duplicate_prob=duplicate_prob,
-            delete_prob=delete_prob,
-            precision=precision,
+            segment_size=given.segment_size,
+            crossover_prob=given.crossover_prob,
+            insert_prob=given.insert_prob,
+            duplicate_prob=given.duplicate_prob,
+            delete_prob=given.delete_prob,
+            precision=given.precision,
         )
-        self.num_envs = num_envs
-        self.num_steps = num_steps
-        self.num_batches = num_batches
-        self.num_trials = num_trials
-        self.life_episodes = life_episodes
-        self.num_updates = num_updates
-        self.batch_size = batch_size
+        self.num_envs = given.num_envs
+        self.num_steps = given.num_steps
         shown = observation_spec["observation"]
-        self.autoencoder = Autoencoder(shown.shape.numel(), highest(shown), hidden_size, num_latents)
-        self.optimiser = torch.optim.SGD(self.parameters(), lr=learning_rate, momentum=0.9)
-        self.population = first_population(num_envs // num_trials, num_latents + 1)
+        self.autoencoder = Autoencoder(shown.shape.numel(), highest(shown), given.hidden_size, given.num_latents)
+        self.optimiser = torch.optim.SGD(self.parameters(), lr=given.learning_rate, momentum=0.9)
+        self.population = first_population(given.num_envs // given.num_trials, given.num_latents + 1)
         self.generation = 0
         self.lived = 0
-        self.register_buffer("rewards", torch.zeros(num_envs, dtype=torch.float32, device="cpu"))
+        self.register_buffer("rewards", torch.zeros(given.num_envs, dtype=torch.float32, device="cpu"))
 
     @property
     def policy(self) -> TensorDictModuleBase:
@@ -412,7 +402,7 @@ class PennA(TakesNumbers, TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` and the next state; ``trial`` is the number of the episode in its life, from 1."""
         rows = torch.arange(len(tensordict), device=tensordict["trial"].device)
-        who = torch.zeros_like(rows) if is_greedy() else rows // self.num_trials % len(self.population.size)
+        who = torch.zeros_like(rows) if is_greedy() else rows // self.settings.num_trials % len(self.population.size)
         lives = self.population.take(who)
         waits = (tensordict["life"] != self.generation) | (tensordict["trial"] == 0)  # for its first episode
         trial = torch.where(waits, 0, tensordict["trial"]) + tensordict["is_init"]
@@ -442,11 +432,11 @@ class PennA(TakesNumbers, TensorDictModuleBase):
         """Add up rewards; after the last batch of a life, let the population reproduce and the autoencoder learn."""
         after = batch["next"]
         is_born = (after["life"] == self.generation) & (after["trial"] > 0)
-        self.rewards += (after["reward"] * (is_born & (after["trial"] <= self.life_episodes))).sum(dim=(1, 2))
+        self.rewards += (after["reward"] * (is_born & (after["trial"] <= self.settings.life_episodes))).sum(dim=(1, 2))
         self.lived += 1
-        if self.lived < self.num_batches:
+        if self.lived < self.settings.num_batches:
             return {}
-        fitness = self.rewards.view(-1, self.num_trials).mean(dim=1)
+        fitness = self.rewards.view(-1, self.settings.num_trials).mean(dim=1)
         measured = {
             "fitness_mean": fitness.mean().item(),
             "fitness_best": fitness.max().item(),
@@ -466,13 +456,13 @@ class PennA(TakesNumbers, TensorDictModuleBase):
             FloatingPointError: if that is not finite.
         """
         total = torch.zeros_like(self.rewards[0])
-        for _ in range(self.num_updates):
-            drawn = torch.randint(len(seen), (self.batch_size,), device=seen.device)
+        for _ in range(self.settings.num_updates):
+            drawn = torch.randint(len(seen), (self.settings.batch_size,), device=seen.device)
             loss = self.autoencoder.loss(seen[drawn])
             minimise(self.optimiser, loss)
             total += loss.detach()
         require_finite("loss_autoencoder", total)
-        return total.item() / self.num_updates
+        return total.item() / self.settings.num_updates
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> PennA:
         """Move the population with everything else."""

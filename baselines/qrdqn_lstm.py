@@ -5,33 +5,37 @@ Dabney et al. 2018 (arXiv 1710.10044) on the recurrent parts of `baselines.parts
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn.functional import huber_loss
-from torchrl.data import Composite, TensorSpec
 
-from baselines.parts.recurrent_q import RecurrentQ
+from baselines.parts.recurrent_q import RecurrentQ, RecurrentQSettings
+from ctgraph_rl.checks import at_least_one, require
+
+
+@dataclass(frozen=True, kw_only=True)
+class QRDQNLSTMSettings(RecurrentQSettings):
+    """The settings of `QRDQNLSTM`."""
+
+    num_quantiles: int  # quantiles of the return's distribution, K
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(*at_least_one(num_quantiles=self.num_quantiles))
 
 
 class QRDQNLSTM(RecurrentQ):
-    """Recurrent Q-learning of K quantiles for each action.
+    """Recurrent Q-learning of K quantiles for each action; its settings are `QRDQNLSTMSettings`."""
 
-    Args:
-        observation_spec: the environment's ``observation_spec_unbatched``.
-        action_spec: the environment's ``action_spec_unbatched``.
-        num_quantiles: quantiles of the return's distribution, K.
-        settings: the arguments of `RecurrentQ`.
-    """
-
+    Settings = QRDQNLSTMSettings
     solves = "partially observable tasks too, if episodes are short enough to remember"
 
-    def __init__(
-        self, observation_spec: Composite, action_spec: TensorSpec, num_quantiles: int, **settings: Any
-    ) -> None:
-        self.num_quantiles = num_quantiles
-        super().__init__(observation_spec, action_spec, **settings)
+    @property
+    def num_quantiles(self) -> int:  # type: ignore[override]
+        """K."""
+        return self.settings.num_quantiles
 
     def distance(self, predicted: Tensor, target: Tensor) -> Tensor:
         """Compute the quantile Huber loss, eq. (10) of the paper with kappa = 1, summed over predicted quantiles."""

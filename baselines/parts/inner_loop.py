@@ -27,8 +27,9 @@ that begin and end within one batch.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -43,7 +44,7 @@ from baselines.parts.learner import Learner
 from baselines.parts.networks import Data, Items, TensorsByName, draw, entropy, guided, is_greedy, num_actions_of
 from baselines.update.trust_region import trust_region_step
 from baselines.update.update import make_optimiser
-from ctgraph_rl.checks import at_least_one, fraction, not_negative, one_of, positive, require
+from ctgraph_rl.checks import at_least_one, fraction, make_fields_plain, not_negative, one_of, positive, require
 from ctgraph_rl.core.dynamics import beside
 from ctgraph_rl.learn.collect import UNSTORED
 
@@ -261,102 +262,90 @@ class InnerPolicy(TensorDictModuleBase):
             data.set(("next", kept), steps[:, first:])
 
 
+@dataclass(frozen=True, kw_only=True)
+class InnerLoopSettings:
+    """The settings of `InnerLoop`."""
+
+    num_envs: int  # rows, each with one trial at a time
+    num_steps: int  # steps of each row in a batch: twice those of a trial, so that there is a whole one
+    hidden_size: int  # width of all layers
+    num_layers: int  # layers before the output
+    adapt_episodes: int  # episodes before the adaptation, and after it
+    inner_rate: float  # step size of the adaptation
+    gamma: float  # discount factor
+    gate: str  # modulates layers, see `baselines.parts.gates`: none, soft, hard or hard_straight_through
+    gate_size: int  # units of a gate
+    outer: str  # trpo, whose step needs no Adam, or ppo
+    max_kl: float  # largest mean divergence of a step of TRPO
+    learning_rate: float  # of PPO
+    clip_epsilon: float  # how far the probability ratio of PPO may move
+    num_epochs: int  # steps of PPO on a batch
+    max_grad_norm: float  # the gradients of PPO are scaled down to this norm
+    entropy_coeff: float  # weight in PPO's loss of the entropy before the adaptation
+
+    def __post_init__(self) -> None:
+        make_fields_plain(self)
+        require(
+            *at_least_one(num_steps=self.num_steps, hidden_size=self.hidden_size, num_layers=self.num_layers),
+            *at_least_one(gate_size=self.gate_size, num_epochs=self.num_epochs, adapt_episodes=self.adapt_episodes),
+            *positive(inner_rate=self.inner_rate, max_kl=self.max_kl),
+            *positive(learning_rate=self.learning_rate, clip_epsilon=self.clip_epsilon),
+            *fraction(gamma=self.gamma),
+            *not_negative(entropy_coeff=self.entropy_coeff),
+            *one_of(GATES, gate=self.gate),
+            *one_of(OUTER, outer=self.outer),
+        )
+        ignored = f"entropy_coeff is of outer=ppo: set it to 0, got {self.entropy_coeff!r} with outer={self.outer!r}"
+        require((self.outer == "ppo" or self.entropy_coeff == 0, ignored))
+        trial = 2 * self.adapt_episodes
+        short = f"num_steps must be at least the 2 * adapt_episodes={trial} episodes of a trial, got {self.num_steps}"
+        require((self.num_steps >= trial, short))
+
+
 class InnerLoop(Learner):
     """A policy that adapts within a trial; a class that derives from it says which weights do.
 
     Args:
         observation_spec: the environment's ``observation_spec_unbatched``.
         action_spec: the environment's ``action_spec_unbatched``.
-        num_envs: rows, each with one trial at a time.
-        num_steps: steps of each row in a batch: twice those of a trial, so that there is a whole one.
-        hidden_size: width of all layers.
-        num_layers: layers before the output.
-        adapt_episodes: episodes before the adaptation, and after it.
-        inner_rate: step size of the adaptation.
-        gamma: discount factor.
-        gate: modulates layers, see `baselines.parts.gates`: ``none``, ``soft``, ``hard`` or ``hard_straight_through``.
-        gate_size: units of a gate.
-        outer: ``trpo``, whose step needs no Adam, or ``ppo``.
-        max_kl: largest mean divergence of a step of TRPO.
-        learning_rate: of PPO.
-        clip_epsilon: how far the probability ratio of PPO may move.
-        num_epochs: steps of PPO on a batch.
-        max_grad_norm: the gradients of PPO are scaled down to this norm.
-        entropy_coeff: weight in PPO's loss of the entropy before the adaptation.
+        settings: the fields of the class's `Settings`.
     """
 
+    Settings: ClassVar[Any] = InnerLoopSettings
+    settings: Any
     memory = True
     needs_whole_trials = True
     output_keys = ("log_probs",)
     minibatch_size = 0  # batches differ in their number of trials
-    num_context = 0
-    """Inputs of the network beside observations."""
 
     policy: InnerPolicy
 
-    def __init__(
-        self,
-        observation_spec: Composite,
-        action_spec: TensorSpec,
-        num_envs: int,
-        num_steps: int,
-        hidden_size: int,
-        num_layers: int,
-        adapt_episodes: int,
-        inner_rate: float,
-        gamma: float,
-        gate: str,
-        gate_size: int,
-        outer: str,
-        max_kl: float,
-        learning_rate: float,
-        clip_epsilon: float,
-        num_epochs: int,
-        max_grad_norm: float,
-        entropy_coeff: float,
-    ) -> None:
-        super().__init__(num_envs, num_steps, max_grad_norm)
-        require(
-            *at_least_one(
-                hidden_size=hidden_size,
-                num_layers=num_layers,
-                gate_size=gate_size,
-                num_epochs=num_epochs,
-                adapt_episodes=adapt_episodes,
-            ),
-            *positive(inner_rate=inner_rate, max_kl=max_kl, learning_rate=learning_rate, clip_epsilon=clip_epsilon),
-            *fraction(gamma=gamma),
-            *not_negative(entropy_coeff=entropy_coeff),
-            *one_of(GATES, gate=gate),
-            *one_of(OUTER, outer=outer),
-        )
-        ignored = f"entropy_coeff is of outer=ppo: set it to 0, got {entropy_coeff!r} with outer={outer!r}"
-        require((outer == "ppo" or entropy_coeff == 0, ignored))
-        short = f"num_steps must be at least the 2 * adapt_episodes={2 * adapt_episodes} episodes of a trial"
-        require((num_steps >= 2 * adapt_episodes, f"{short}, got {num_steps}"))
-        self.adapt_episodes = adapt_episodes
-        self.trial_episodes = 2 * adapt_episodes
-        self.entropy_coeff = entropy_coeff
-        self.outer = outer
-        self.max_kl = max_kl
-        self.clip_epsilon = clip_epsilon
-        self.num_epochs = num_epochs
-        num_actions = num_actions_of(action_spec)
-        require_gated_weights(
-            observation_spec, hidden_size, num_layers, num_context=self.num_context, gate_size=gate_size
-        )
+    def __init__(self, observation_spec: Composite, action_spec: TensorSpec, **settings: Any) -> None:
+        self.settings = given = self.Settings(**settings)
+        super().__init__(given.num_envs, given.num_steps, given.max_grad_norm)
+        self.adapt_episodes = given.adapt_episodes
+        self.trial_episodes = 2 * given.adapt_episodes
+        hidden = given.hidden_size, given.num_layers
+        require_gated_weights(observation_spec, *hidden, num_context=self.num_context, gate_size=given.gate_size)
         self.specs = shown_specs(observation_spec)
+        num_actions = num_actions_of(action_spec)
         net = gated_network(
             self.specs,
             self.num_context,
             num_actions,
-            hidden_size=hidden_size,
-            num_layers=num_layers,
-            gate=gate,
-            gate_size=gate_size,
+            hidden_size=given.hidden_size,
+            num_layers=given.num_layers,
+            gate=given.gate,
+            gate_size=given.gate_size,
         )
-        self.policy = InnerPolicy(self.make_model(net, inner_rate), list(self.specs), adapt_episodes, gamma)
-        self.optimiser = make_optimiser("adam", net.parameters(), learning_rate)
+        model = self.make_model(net, given.inner_rate)
+        self.policy = InnerPolicy(model, list(self.specs), given.adapt_episodes, given.gamma)
+        self.optimiser = make_optimiser("adam", net.parameters(), given.learning_rate)
+
+    @property
+    def num_context(self) -> int:
+        """Inputs of the network beside observations."""
+        return 0
 
     def make_model(self, net: GatedNetwork, inner_rate: float) -> InnerModel:
         """Return the model of a network."""
@@ -388,7 +377,7 @@ class InnerLoop(Learner):
         """Yield the whole trials of a batch, if it has any, as often as the outer loop takes a step on them."""
         trials = self.trials(batch)
         if trials is not None:
-            for _ in range(1 if self.outer == "trpo" else self.num_epochs):
+            for _ in range(1 if self.settings.outer == "trpo" else self.settings.num_epochs):
                 yield trials
 
     @torch.no_grad()
@@ -452,25 +441,25 @@ class InnerLoop(Learner):
     def loss(self, batch: Data) -> TensorsByName:
         """Compute the outer loss of what `trials` returned, and that of the entropy before the adaptation."""
         losses = {"loss_policy": self._outer_loss(batch, self._adapted_logits(batch))}
-        if self.entropy_coeff > 0:
+        if self.settings.entropy_coeff > 0:
             theta = self.model.theta
             logits = self.model.logits(theta, self.model.start(theta), self._seen_before(batch))
             entropies = entropy(logits.log_softmax(dim=-1))
-            weight = -self.entropy_coeff * batch["before", "weight"]
+            weight = -self.settings.entropy_coeff * batch["before", "weight"]
             losses["loss_entropy"] = (weight * entropies).sum(dim=1).mean()
         return losses
 
     def _outer_loss(self, batch: Data, logits: Tensor) -> Tensor:
         ratio = (log_prob(logits, batch["action"]) - batch["log_prob"]).exp()
         gain = ratio * batch["advantage"]
-        if self.outer == "ppo":
-            clipped = ratio.clamp(1 - self.clip_epsilon, 1 + self.clip_epsilon) * batch["advantage"]
+        if self.settings.outer == "ppo":
+            clipped = ratio.clamp(1 - self.settings.clip_epsilon, 1 + self.settings.clip_epsilon) * batch["advantage"]
             gain = torch.minimum(gain, clipped)
         return -(batch["weight"] * gain).sum(dim=1).mean()
 
     def gradient_step(self, batch: Data) -> TensorsByName:
         """Take a step of the outer loop; return what was measured."""
-        if self.outer == "ppo":
+        if self.settings.outer == "ppo":
             measured = super().gradient_step(batch)
         else:
             measured = trust_region_step(
@@ -478,7 +467,7 @@ class InnerLoop(Learner):
                 partial(self._adapted_logits, batch),
                 partial(self._outer_loss, batch),
                 weight=batch["weight"] / len(batch["weight"]),
-                max_kl=self.max_kl,
+                max_kl=self.settings.max_kl,
             )
         return {
             **measured,

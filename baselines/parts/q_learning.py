@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from copy import deepcopy
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -17,11 +18,21 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import EGreedyModule
 
 from baselines.parts.learner import MOST_PASSES, Learner
-from baselines.parts.networks import Data, Items, TensorsByName, guided, is_greedy, most_likely
+from baselines.parts.networks import Data, Items, TensorsByName, guided, is_greedy, most_likely, num_actions_of
 from baselines.parts.prioritized import PrioritySampler
 from baselines.update.measured import table_of
 from baselines.update.update import make_optimiser
-from ctgraph_rl.checks import NamedValues, at_least_one, at_most, fraction, one_of, positive, require, require_memory
+from ctgraph_rl.checks import (
+    NamedValues,
+    at_least_one,
+    at_most,
+    fraction,
+    make_fields_plain,
+    one_of,
+    positive,
+    require,
+    require_memory,
+)
 from ctgraph_rl.core.device import torchs_defaults
 
 LONGEST_TARGET = 10**4
@@ -104,77 +115,83 @@ class EpsilonGreedy(TensorDictSequential):
         return values[0] if isinstance(values, tuple) else values, written
 
 
+@dataclass(frozen=True, kw_only=True)
+class QLearnerSettings:
+    """The settings of `QLearner`, which an agent extends by its own."""
+
+    num_envs: int  # environments that it learns from
+    num_steps: int  # steps of each environment between two rounds of updates
+    hidden_size: int  # width of the layers
+    learning_rate: float  # of the optimiser
+    gamma: float  # discount factor
+    n_steps: int  # steps of a multi-step target (uncorrected)
+    buffer_size: int  # steps that the replay buffer keeps
+    batch_size: int  # items that a gradient step learns from
+    num_updates: int  # gradient steps after each batch of data
+    target_update_interval: int  # gradient steps between two copies to the target network
+    eps_init: float  # exploration at the start of a task
+    eps_end: float  # exploration after annealing_num_steps
+    annealing_num_steps: int  # frames of a task over which exploration falls linearly
+    max_grad_norm: float  # gradients are scaled down to this norm
+    replay_on_task_change: str  # clear or keep the replay buffer where a task change is announced
+    compile: bool = False  # run gradient steps through torch.compile; only without memory
+    encoder: str = "mlp"  # mlp, or cnn with two convolutions before the first layer, for images
+
+    def __post_init__(self) -> None:
+        make_fields_plain(self)
+        require(
+            *at_least_one(num_steps=self.num_steps, hidden_size=self.hidden_size, buffer_size=self.buffer_size),
+            *at_least_one(n_steps=self.n_steps, batch_size=self.batch_size, num_updates=self.num_updates),
+            *at_least_one(target_update_interval=self.target_update_interval),
+            *at_least_one(annealing_num_steps=self.annealing_num_steps),
+            *at_most(MOST_PASSES, num_updates=self.num_updates),
+            *at_most(LONGEST_TARGET, n_steps=self.n_steps),
+            *positive(learning_rate=self.learning_rate, gamma=self.gamma),
+            *fraction(gamma=self.gamma, eps_init=self.eps_init, eps_end=self.eps_end),
+            *one_of(("clear", "keep"), replay_on_task_change=self.replay_on_task_change),
+        )
+        falls = f"eps_end must be <= eps_init={self.eps_init!r}, got {self.eps_end!r}"
+        require((self.eps_end <= self.eps_init, falls))
+
+
 class QLearner(Learner):
     """Learns action values from replayed experience; explores by random actions, less and less within a task.
 
-    A class that derives from it calls `set_networks`, and defines `experience` and the loss. A loss that takes
-    ``others`` gets the target network's weights, for `with_others`.
+    A class that derives from it calls `set_networks`, and defines `require_room`, `experience` and the loss. A loss
+    that takes ``others`` gets the target network's weights, for `with_others`.
 
     Args:
-        num_envs: environments that it learns from.
-        num_steps: steps of each environment between two rounds of updates.
-        gamma: discount factor.
-        n_steps: steps of a multi-step target (uncorrected).
-        buffer_size: steps that the replay buffer keeps.
-        batch_size: items that a gradient step learns from.
-        num_updates: gradient steps after each batch of data.
-        target_update_interval: gradient steps between two copies to the target network.
-        eps_init: exploration at the start of a task.
-        eps_end: exploration after ``annealing_num_steps``.
-        annealing_num_steps: frames of a task over which exploration falls linearly.
-        max_grad_norm: gradients are scaled down to this norm.
-        replay_on_task_change: ``clear`` or ``keep`` the replay buffer where a task change is announced.
-        compile: run gradient steps through ``torch.compile``; only without memory.
+        observation_spec: the environment's ``observation_spec_unbatched``.
+        action_spec: the environment's ``action_spec_unbatched``.
+        settings: the fields of the class's `Settings`.
     """
 
+    Settings: ClassVar[Any] = QLearnerSettings
+    settings: Any
     output_keys = ("action_value",)
 
-    priority_alpha = priority_beta = 0.0
-    """How strongly priorities count, and how much of that the loss corrects; alpha = 0 is uniform replay."""
-
-    def __init__(
-        self,
-        num_envs: int,
-        num_steps: int,
-        gamma: float,
-        n_steps: int,
-        buffer_size: int,
-        batch_size: int,
-        num_updates: int,
-        target_update_interval: int,
-        eps_init: float,
-        eps_end: float,
-        annealing_num_steps: int,
-        max_grad_norm: float,
-        replay_on_task_change: str,
-        compile: bool = False,
-    ) -> None:
-        super().__init__(num_envs, num_steps, max_grad_norm, compile)
-        require(
-            *at_least_one(n_steps=n_steps, batch_size=batch_size, num_updates=num_updates, buffer_size=buffer_size),
-            *at_least_one(target_update_interval=target_update_interval, annealing_num_steps=annealing_num_steps),
-            *at_most(MOST_PASSES, num_updates=num_updates),
-            *at_most(LONGEST_TARGET, n_steps=n_steps),
-            *positive(gamma=gamma),
-            *fraction(gamma=gamma, eps_init=eps_init, eps_end=eps_end),
-            *one_of(("clear", "keep"), replay_on_task_change=replay_on_task_change),
-        )
-        require((eps_end <= eps_init, f"eps_end must be <= eps_init={eps_init!r}, got {eps_end!r}"))
-        self.minibatch_size = batch_size
-        self.num_updates = num_updates
-        self.replay_on_task_change = replay_on_task_change
-        self.eps_range = float(eps_init), float(eps_end)
-        self.annealing_batches = max(1, annealing_num_steps // (num_envs * num_steps))
-        self.target_update_interval = target_update_interval
+    def __init__(self, observation_spec: Composite, action_spec: TensorSpec, **settings: Any) -> None:
+        self.settings = given = self.Settings(**settings)
+        super().__init__(given.num_envs, given.num_steps, given.max_grad_norm, given.compile)
+        self.require_room(observation_spec, num_actions_of(action_spec))
+        self.minibatch_size = given.batch_size
+        self.annealing_batches = max(1, given.annealing_num_steps // (given.num_envs * given.num_steps))
         with torchs_defaults():  # TorchRL's table of discounts names no device
-            self.multi_step = MultiStep(gamma, n_steps)
+            self.multi_step = MultiStep(given.gamma, given.n_steps)
         self.multi_step.done_keys = ()  # so that the end of an episode is known where the target reaches it
-        self.prioritized = self.priority_alpha != 0
-        size = self.num_items(buffer_size)
-        alpha = self.priority_alpha
-        sampler = PrioritySampler(size, alpha, self.priority_beta) if self.prioritized else RandomSampler()
+        size = self.num_items(given.buffer_size)
+        sampler = self.make_sampler(size)
+        self.prioritized = isinstance(sampler, PrioritySampler)
         storage = LazyTensorStorage(size)
-        self.replay = TensorDictReplayBuffer(storage=storage, sampler=sampler, batch_size=batch_size)
+        self.replay = TensorDictReplayBuffer(storage=storage, sampler=sampler, batch_size=given.batch_size)
+
+    def require_room(self, observation_spec: Composite, num_actions: int) -> None:
+        """Refuse networks and replay that the machine cannot hold."""
+        raise NotImplementedError
+
+    def make_sampler(self, size: int) -> Any:
+        """Return what draws from a replay buffer of so many items."""
+        return RandomSampler()
 
     def num_items(self, num_steps: int) -> int:
         """Return how many items of the replay buffer hold so many steps."""
@@ -184,7 +201,6 @@ class QLearner(Learner):
         self,
         greedy: TensorDictModuleBase,
         action_spec: TensorSpec,
-        learning_rate: float,
         *state: Any,
         copied: Sequence[TensorDictModule] = (),
     ) -> None:
@@ -193,11 +209,11 @@ class QLearner(Learner):
         Args:
             greedy: writes the best ``action``.
             action_spec: the actions that exploration draws from.
-            learning_rate: of Adam.
             state: keys under which the network writes its recurrent state.
             copied: what `copied_action` returns for the network.
         """
-        self.exploration = Exploration(action_spec, *self.eps_range, self.annealing_batches)
+        eps = float(self.settings.eps_init), float(self.settings.eps_end)
+        self.exploration = Exploration(action_spec, *eps, self.annealing_batches)
         keys = ["action", *state]
         for module in copied:
             keys += module.out_keys
@@ -205,12 +221,12 @@ class QLearner(Learner):
         self.greedy = greedy
         self.target = deepcopy(greedy).requires_grad_(False)
         self.target_age = 0
-        self.optimiser = make_optimiser("adam", greedy.parameters(), learning_rate)
+        self.optimiser = make_optimiser("adam", greedy.parameters(), self.settings.learning_rate)
 
     def start_task(self, task: int | None = None) -> None:
         """Reset exploration; clear the replay buffer if so configured."""
         self.exploration.eps.copy_(self.exploration.eps_init)
-        if self.replay_on_task_change == "clear":
+        if self.settings.replay_on_task_change == "clear":
             self.replay.empty()
 
     def other_weights(self) -> TensorsByName:
@@ -245,7 +261,7 @@ class QLearner(Learner):
         self.replay.extend(self.experience(self.with_targets(batch)))
         storage = self.replay.storage
         device = next(self.parameters()).device
-        for _ in range(self.num_updates):
+        for _ in range(self.settings.num_updates):
             self.replayed, more = self.replay.sampler.sample(storage, self.minibatch_size)
             stored = storage._storage.items(True, True)  # the buffer stays on the CPU
             items = {key: value.index_select(0, self.replayed).to(device) for key, value in stored}
@@ -260,7 +276,7 @@ class QLearner(Learner):
             self.means(list(measured), table_of([measured]))  # raises before a priority becomes NaN
             self.replay.update_priority(self.replayed, squared.cpu().sqrt())
         self.target_age += 1
-        if self.target_age == self.target_update_interval:
+        if self.target_age == self.settings.target_update_interval:
             self.weights_changed()
         return measured
 
@@ -272,7 +288,7 @@ class QLearner(Learner):
     @property
     def needs_weights(self) -> bool:
         """Whether the target network gets the weights after the next gradient step."""
-        return self.prioritized or self.target_age == self.target_update_interval - 1
+        return self.prioritized or self.target_age == self.settings.target_update_interval - 1
 
     def get_extra_state(self) -> NamedValues:
         """Return the optimiser's state, the replay buffer and the age of the target network in gradient steps."""

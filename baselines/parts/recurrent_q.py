@@ -7,7 +7,8 @@ one, to bootstrap from.
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase, pad
@@ -15,12 +16,13 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 from torchrl.modules import QValueActor
+from typing_extensions import override
 
 from baselines.cells.cell import MakeCell, linear_layer
 from baselines.cells.lstm import LSTM
 from baselines.parts.networks import Data, TensorsByName, copied_action, num_actions_of, recurrent, require_weights
-from baselines.parts.q_learning import QLearner, require_replay
-from ctgraph_rl.checks import at_least_one, is_int, positive, require
+from baselines.parts.q_learning import QLearner, QLearnerSettings, require_replay
+from ctgraph_rl.checks import require
 from ctgraph_rl.learn.collect import UNSTORED
 
 
@@ -50,56 +52,53 @@ def of_action(quantiles: Tensor, action: Tensor) -> Tensor:
     return quantiles.gather(-2, index).squeeze(-2)
 
 
+@dataclass(frozen=True, kw_only=True)
+class RecurrentQSettings(QLearnerSettings):
+    """The settings of `RecurrentQ`; batches are sequences of ``num_steps`` steps."""
+
+    cell: MakeCell = LSTM  # what remembers, a class of `baselines.cells` or a partial of one
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        short = f"buffer_size must be an integer >= num_steps={self.num_steps!r}, got {self.buffer_size!r}"
+        require((self.buffer_size >= self.num_steps, short))
+
+
 class RecurrentQ(QLearner):
     """Q-learning with a cell; classes that derive from it define the distance of predictions from targets.
 
     Args:
         observation_spec: the environment's ``observation_spec_unbatched``.
         action_spec: the environment's ``action_spec_unbatched``.
-        hidden_size: width of features and cell.
-        learning_rate: of Adam.
-        cell: what remembers, a class of `baselines.cells` or a partial of one.
-        encoder: ``mlp``, or ``cnn`` with two convolutions before the first layer, for images.
-        settings: the arguments of `QLearner`; batches are sequences of ``num_steps`` steps.
+        settings: the fields of the class's `Settings`.
     """
 
+    Settings: ClassVar[Any] = RecurrentQSettings
     memory = True
     num_quantiles = 1
 
-    def __init__(
-        self,
-        observation_spec: Composite,
-        action_spec: TensorSpec,
-        hidden_size: int,
-        learning_rate: float,
-        cell: MakeCell = LSTM,
-        encoder: str = "mlp",
-        **settings: Any,
-    ) -> None:
-        num_steps = settings["num_steps"]
-        buffer_size = settings["buffer_size"]
-        holds_one = is_int(buffer_size) and (not is_int(num_steps, 1) or buffer_size >= num_steps)
-        require(
-            *at_least_one(hidden_size=hidden_size, num_quantiles=self.num_quantiles, num_steps=num_steps),
-            *positive(learning_rate=learning_rate),
-            (holds_one, f"buffer_size must be an integer >= num_steps={num_steps!r}, got {buffer_size!r}"),
-        )
+    def __init__(self, observation_spec: Composite, action_spec: TensorSpec, **settings: Any) -> None:
+        super().__init__(observation_spec, action_spec, **settings)
+        given = self.settings
+        width = given.hidden_size
         num_actions = num_actions_of(action_spec)
-        require_weights(observation_spec, hidden_size, 1, num_actions * self.num_quantiles, memory=True)
-        pairs = num_steps * self.num_quantiles**2
-        require_replay(observation_spec, buffer_size, settings["batch_size"], pairs)
-        super().__init__(**settings)
-        self.trunk = recurrent(observation_spec, hidden_size, 1, num_actions, make_cell=cell, kind=encoder)
+        self.trunk = recurrent(observation_spec, width, 1, num_actions, make_cell=given.cell, kind=given.encoder)
         stored = not any(key.startswith(UNSTORED) for key in self.trunk.state_keys)
         kind = type(self.trunk.module[1]).__name__
         message = f"{type(self).__name__} replays sequences, which need a cell whose state is stored, not {kind}"
         require((stored, f"{message}: use agent=lstm_ppo"))
-        head = Quantiles(hidden_size, num_actions, self.num_quantiles)
+        head = Quantiles(width, num_actions, self.num_quantiles)
         values = TensorDictModule(head, in_keys=["memory"], out_keys=["action_value", "quantiles"])
         greedy = QValueActor(TensorDictSequential(self.trunk, values), in_keys=self.trunk.in_keys, spec=action_spec)
         state = self.trunk.out_keys[1:]
-        copied = copied_action(self.trunk.in_keys)
-        self.set_networks(greedy, action_spec, learning_rate, *state, copied=copied)
+        self.set_networks(greedy, action_spec, *state, copied=copied_action(self.trunk.in_keys))
+
+    @override
+    def require_room(self, observation_spec: Composite, num_actions: int) -> None:
+        given = self.settings
+        require_weights(observation_spec, given.hidden_size, 1, num_actions * self.num_quantiles, memory=True)
+        pairs = given.num_steps * self.num_quantiles**2
+        require_replay(observation_spec, given.buffer_size, given.batch_size, pairs)
 
     def values(self, data: Data) -> Tensor:
         """Compute the means of the network's quantiles."""

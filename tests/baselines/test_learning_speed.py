@@ -188,9 +188,9 @@ def test_a_loss_and_its_gradients_in_plain_tensors_equal_torchrls(small_agent, n
 def test_the_loss_of_dqn_in_plain_tensors_equals_torchrls(small_agent, double):
     agent = small_agent("dqn", [ct_su_b1()], f"agent.double={double}", "agent.priority_alpha=0.6")
     agent.learn(batches(agent, ct_su_b1(), 1)[0])
-    of_torchrl = DQNLoss(agent.greedy, delay_value=True, double_dqn=agent.is_double, action_space="categorical")
+    of_torchrl = DQNLoss(agent.greedy, delay_value=True, double_dqn=agent.settings.double, action_space="categorical")
     of_torchrl.target_value_network_params.data.update_(TensorDict.from_module(agent.target).data)
-    of_torchrl.make_value_estimator(ValueEstimators.TD0, gamma=agent.gamma)
+    of_torchrl.make_value_estimator(ValueEstimators.TD0, gamma=agent.settings.gamma)
     sample = agent.replay[:].set("priority_weight", torch.rand(128))
 
     losses = agent.loss(sample)

@@ -74,7 +74,7 @@ def test_what_is_not_given_is_what_the_yaml_files_say():
 
     agent = make_agent("dqn", TASKS, num_envs=16, buffer_size=64, batch_size=8, num_steps=1)
 
-    assert agent.gamma == composed(["agent=dqn"]).agent.gamma
+    assert agent.settings.gamma == composed(["agent=dqn"]).agent.gamma
     assert isinstance(make_agent("lstm_ppo", TASKS, cell="gru", **SMALL).trunk.module[1], GRU)
     assert torch.get_num_threads() == composed([]).num_threads
 
