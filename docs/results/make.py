@@ -50,17 +50,6 @@ def _add_measurements(commands: Any) -> None:
     collecting.add_argument("runs", type=Path, nargs="+", help="folders with runs of experiment=every_curriculum")
     collecting.set_defaults(run=lambda options: import_module("studies.every_curriculum").collect(options.runs))
 
-    submitting = commands.add_parser("submit", help="make submissions to the board from runs of a track")
-    submitting.add_argument("runs", type=Path, help="folder with run directories")
-    submitting.add_argument("commit", help="of the code that ran them")
-    submitting.add_argument("--track", default="small", help="that the runs are of")
-    submitting.add_argument("--given", default="", help="ends the names of submissions, such as -at_boundaries")
-    submitting.set_defaults(
-        run=lambda options: import_module("studies.board").submit_all(
-            options.runs, options.commit, options.given, options.track
-        )
-    )
-
     measuring = commands.add_parser("gpu", help="measure a GPU for four minutes, into gpu.json and its page")
     measuring.add_argument("--minutes", type=float, default=4.0, help="limit of a call; the next call continues")
     measuring.add_argument("--commit", default="", help="what is measured, where the checkout has no .git")

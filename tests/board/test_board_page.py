@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import sys
+from statistics import fmean
 
 import pytest
 from helpers.paths import CHECKOUT
@@ -112,6 +113,13 @@ def test_the_table_says_what_the_page_says_of_it(made):
     assert {(name, rank) for name, rank in ranks[13:]} == {
         (name, "13 to 18") for name in ("LSTM-PPO", "PPO with a count-based bonus", "REINFORCE", "A2C", "PPO")
     }
+    assert max(fmean(line.entry.values["forgetting"]) for line in made[0].standings[:10]) < 0.05
+    [mask_sc] = [line.entry for line in made[0].standings if line.name == "PPO + MaskSC"]
+    assert set(mask_sc.values["forgetting"]) == {0.0} and fmean(mask_sc.scores) < 0.95
+    page = " ".join((RESULTS / "board.md").read_text(encoding="utf-8").split())
+    assert made[0].num_seeds == 20 and "Ten keep nearly everything. 20 seeds cannot order them:" in page
+    assert "CLEAR are behind them, then CKA-RL and agents without a method." in page
+    assert "MaskSC, which forgets nothing but does not learn every task," in page
 
 
 def test_the_command_of_the_page_verifies_a_submission(tmp_path, monkeypatch):

@@ -68,25 +68,3 @@ def test_the_mean_forward_transfer_is_continual_worlds(comparison):
     expected = metrics.continual_world_forward_transfer(areas, torch.from_numpy(alone)).value
     assert found == pytest.approx(expected, abs=1e-12)
     assert comparison.transfer(own, alone, []).startswith(f"{expected:.2f} ")
-
-
-@pytest.fixture
-def experiments():
-    from studies.lifelong import experiments
-
-    return experiments
-
-
-def test_what_was_not_run_is_named_by_method_and_seed(experiments, monkeypatch):
-    monkeypatch.setattr(experiments, "expected", lambda name: {"method": ["a", "b"], "seed": ["0", "1", "2"]})
-    monkeypatch.setattr(experiments, "read", lambda name: [{"method": "a", "seed": "1"}, {"method": "b", "seed": "2"}])
-
-    assert experiments.missing("x") == "Not run yet: 4 of 6 cells, a (seeds 0, 2); b (seeds 0, 1)."
-
-
-def test_further_seeds_of_an_agent_are_cells_of_its_experiment(experiments, monkeypatch):
-    monkeypatch.setattr(experiments, "expected", lambda name: {"agent": ["a", "b"], "seed": ["0"]})
-    monkeypatch.setattr(experiments, "MORE_SEEDS", {"x": {"b": 3}})
-    monkeypatch.setattr(experiments, "read", lambda name: [{"agent": "a", "seed": "0"}, {"agent": "b", "seed": "1"}])
-
-    assert experiments.missing("x") == "Not run yet: 2 of 4 cells, b (seeds 0, 2)."

@@ -43,17 +43,8 @@ def tasks_table() -> str:
 
 def texts() -> dict[str, str]:
     """Return what the page's template names."""
-    found = {"selecting": tasks_table(), "selecting_missing": _missing()}
+    found = {"selecting": tasks_table()}
     for method in METHODS:
         counts = sorted(tasks_learned(method))
         found[f"learned_{method}"] = f"{counts[0]} to {counts[-1]}" if counts[0] < counts[-1] else str(counts[0])
     return found
-
-
-def _missing() -> str:
-    parts = [
-        f"{SEEDS - count} of {SEEDS} seeds of {name}"
-        for method, name in METHODS.items()
-        if (count := len(tasks_learned(method))) < SEEDS
-    ]
-    return f"Not run yet: {'; '.join(parts)}." if parts else "All seeds that were planned are here."

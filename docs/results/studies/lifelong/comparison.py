@@ -13,7 +13,7 @@ import torch
 from ctgraph_rl import metrics
 from ctgraph_rl.metrics import METRICS, Curves
 from ctgraph_rl.metrics.bounds import Known
-from studies.lifelong.experiments import MASKS, expected, missing
+from studies.lifelong.experiments import MASKS, expected
 from studies.raw import Raw, groups, mean_of, read, shown, table
 from studies.two_groups import two_groups
 
@@ -103,7 +103,7 @@ COLUMNS = (
 
 
 def summary(name: str) -> str:
-    """A line for each method: every number's mean over seeds with its interval; then what is missing."""
+    """A line for each method: every number's mean over seeds with its interval; then what was left out."""
     of = groups(read(name), "method", "seed")
     if not of:
         return f"Nothing was run yet: `ctgraph-rl -m experiment={name}`."
@@ -117,7 +117,7 @@ def summary(name: str) -> str:
         rows.append([f"`{method}`", *(values[column] for column in COLUMNS)])
     tasks = f"task {', '.join(map(str, left_out))}" if left_out else "none"
     seeds = f"{len(experts)} seeds of each method and of the experts."
-    said = f"{seeds} Left out of forward transfer: {tasks}. {missing(name)}"
+    said = f"{seeds} Left out of forward transfer: {tasks}."
     return f"{table(['method', *COLUMNS], rows)}\n\n{said}"
 
 
@@ -202,4 +202,4 @@ def _thousands(run: Curves) -> torch.Tensor:
 
 def tables(names: Sequence[str] = MASKS) -> dict[str, str]:
     """What the template of the page names."""
-    return {name: summary(name) for name in names} | {"methods_missing": missing("methods")}
+    return {name: summary(name) for name in names}

@@ -9,7 +9,7 @@ from string import Template
 from ctgraph_rl.report.statistics import Comparison
 from studies.lifelong.pairs import of_pairs, rows
 from studies.no_labels import figures, task_free
-from studies.no_labels.learners import FOUND, IMAGES, LEARNERS, MASKS, NAME, PLANNED, SPANS, finished, values
+from studies.no_labels.learners import FOUND, IMAGES, LEARNERS, MASKS, NAME, SPANS, finished, values
 from studies.raw import HERE, TEMPLATES, Raw, groups, machines, mean_of, read, table
 from studies.verdicts import undecided
 
@@ -147,18 +147,6 @@ COMPARED = (
 )
 
 
-def not_run() -> str:
-    """Return a list of what the page has no number of."""
-    of = finished()
-    missing = {place: [LEARNERS[n] for n in names if n not in of.get(place, {})] for place, names in PLANNED.items()}
-    lines = [
-        f"- `{name}` with stays of {int(stay):,} frames: {'; '.join(each) if (name, stay) in of else 'all'}."
-        for (name, stay), each in missing.items()
-        if each
-    ]
-    return "\n".join(["No number is on this page of:", "", *lines]) if lines else "Everything that was planned has run."
-
-
 def numbers() -> dict[str, str]:
     """Return the numbers within the text of the page that follow from several tables."""
     names = {"swoks_online": "swoks, fresh", "adwin_online": "adwin", "oracle_online": "oracle"}
@@ -177,7 +165,6 @@ def page() -> str:
         "masks": masks(),
         "compared": compared(),
         "task_free": task_free.results(),
-        "not_run": not_run(),
     }
     return template.substitute(tables, machines=machines(NAME, task_free.NAME), **numbers())
 

@@ -6,7 +6,8 @@ from statistics import fmean
 
 from studies.baselines import instances, search
 from studies.raw import groups, numbers_in, read
-from studies.sentences import Sentences
+
+from helpers.conclusions.sentences import Sentences
 
 says = Sentences()
 

@@ -8,7 +8,8 @@ from statistics import fmean
 from studies.collectives import mosaic, selecting
 from studies.collectives.l2d2c import new_and_known, on_l2d2c
 from studies.raw import groups, numbers_in, read
-from studies.sentences import Sentences
+
+from helpers.conclusions.sentences import Sentences
 
 says = Sentences()
 

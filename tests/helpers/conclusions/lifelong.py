@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import torch
-
-from ctgraph_rl.report.statistics import compare
 from studies.lifelong.experiments import MASKS, eight
 from studies.lifelong.mastered import Table
-from studies.sentences import Sentences
 from studies.verdicts import ALPHA
+
+from ctgraph_rl.report.statistics import compare
+from helpers.conclusions.sentences import Sentences
 
 says = Sentences()
 

@@ -1,0 +1,1 @@
+"""What the pages of results conclude, each sentence with what raw results must be for it."""
