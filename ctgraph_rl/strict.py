@@ -43,6 +43,16 @@ def named(path: Path) -> Iterator[None]:
         raise ValueError(str(error) if str(path) in str(error) else f"{path} {error}") from None
 
 
+@contextmanager
+def within(place: object) -> Iterator[None]:
+    """Begin errors with the file or the key that they are about, unless they do."""
+    try:
+        yield
+    except ValueError as error:
+        text = str(error)
+        raise ValueError(text if text.startswith(str(place)) else f"{place}: {text}") from error
+
+
 def json_value(content: bytes, finite: bool = True, nesting: int = MAX_NESTING) -> Any:
     """Return the value of a JSON text in UTF-8.
 

@@ -142,7 +142,7 @@ def from_axes(
     whole = bool(depths) and are_ints(depths, 1)
     require((whole, f"depth must be an integer >= 1 or a list of them, got {depth!r}"))
     if random_graphs is None:
-        b = task.graph.branching_factor if branching_factor is None else branching_factor
+        b: Any = task.graph.branching_factor if branching_factor is None else branching_factor
         graph = replace(task.graph, branching_factor=b, depth=max(depths))
         graphs = axes.as_tasks(axes.reshaped(task, graph, kind, (1,) * graph.depth))
     else:
@@ -327,7 +327,7 @@ def _curriculum(
         require((in_order, rule))
         tasks = tuple(replace(task, goal_change=pair) for task in tasks)
     every = 0
-    if is_int(num_frames) and len(set(tasks)) <= MOST_TASKS and num_frames % (EVALUATIONS * ROWS) == 0:
+    if isinstance(num_frames, int) and len(set(tasks)) <= MOST_TASKS and num_frames % (EVALUATIONS * ROWS) == 0:
         every = num_frames // EVALUATIONS
     evaluation = Evaluation(every=every)
     change = tasks[0].goal_change

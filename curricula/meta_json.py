@@ -11,17 +11,15 @@ list, or, by ``task_label_mode``, its place in the curriculum (``curriculum_inde
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from difflib import get_close_matches
 from itertools import accumulate
 from os import PathLike
 from pathlib import Path
 from reprlib import repr as short
 
-from ctgraph_rl.checks import NamedValues, Rule, are_ints, is_int, require, takes_numbers
-from ctgraph_rl.disk import read_regular
-from ctgraph_rl.strict import json_value
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule, are_ints, is_int, require, takes_numbers
+from ctgraph_rl.strict import json_object, within
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Protocol
 from ctgraph_rl.tasks.reference import read_task
@@ -59,19 +57,32 @@ def from_meta_json(path: str | PathLike[str], num_frames: int | Sequence[int], n
     """
     file = Path(path)
     meta = _read(file)
-    with _named(file):
+    with within(file):
         require(*_key_rules(meta))
         require(*_value_rules(meta))
-        environments = [read_environment(_within(file.parent, config)) for config in meta["config_paths"]]
+        paths = [_within(file.parent, config) for config in meta["config_paths"]]
+    environments = [read_environment(path) for path in paths]
+    with within(file):
         pool = Pool([environment["graph"].num_end_states for environment in environments], meta["task_order"])
         numbers = _chosen(meta, pool.size)
         tasks = []
         for config, leaf in map(pool.at, numbers):
             graph = environments[config]["graph"]
             tasks.append(Task(**environments[config] | {"goal": graph.path(graph.num_decision_states + leaf)}))
-        source = f"meta-JSON file {file.name}"
-        protocol = _labels(meta, tasks, numbers)
-        return sequence(name or file.stem, tasks, num_frames, version=1, source=source, protocol=protocol)
+        by_place = meta.get("label_by_curriculum_index", meta.get("task_label_mode") == "curriculum_index")
+        labels = meta.get("task_label_ids", list(range(len(numbers))) if by_place else numbers)
+        length = meta["label_dim"]
+        count = len(tasks)
+        require(
+            (len(labels) == count, f"task_label_ids must be one for each of {count} tasks, got {len(labels)}"),
+            (
+                max(labels) < length,
+                f"label_dim must be at least {max(labels) + 1}, one more than a label, got {length}",
+            ),
+        )
+        ids = tuple(one_id_each(tuple(tasks), labels).values())
+        protocol = Protocol("one_hot", num_task_ids=length, task_ids=ids)
+        return sequence(name or file.stem, tasks, num_frames, source=f"meta-JSON file {file.name}", protocol=protocol)
 
 
 class Pool:
@@ -84,16 +95,15 @@ class Pool:
 
     def __init__(self, sizes: Sequence[int], order: str) -> None:
         self.size = sum(sizes)
-        self.at: Callable[[int], tuple[int, int]] = self._in_turns if order == "interleaved" else self._in_a_row
         self._sizes = tuple(sizes)
+        self._takes_turns = order == "interleaved"
 
-    def _in_a_row(self, number: int) -> tuple[int, int]:
-        starts = [0, *accumulate(self._sizes)]
-        config = bisect_right(starts, number) - 1
-        return config, number - starts[config]
-
-    def _in_turns(self, number: int) -> tuple[int, int]:
-        """The same where environments take turns; those without a further goal are left out."""
+    def at(self, number: int) -> tuple[int, int]:
+        """Return the environment and the goal of a number; environments without a further goal lose their turn."""
+        if not self._takes_turns:
+            starts = [0, *accumulate(self._sizes)]
+            config = bisect_right(starts, number) - 1
+            return config, number - starts[config]
         done = 0
         for end in sorted(set(self._sizes)):
             active = [config for config, size in enumerate(self._sizes) if size > done]
@@ -107,11 +117,15 @@ class Pool:
 def read_environment(path: Path) -> NamedValues:
     """The arguments of `Task` for an environment file, its goal still missing."""
     content = _read(path)
-    with _named(path):
+    with within(path):
         return read_task(content, ())
 
 
-def _chosen(meta: NamedValues, pool_size: int) -> list[int]:
+def _read(path: Path) -> ReadOnlyValues:
+    return json_object(path, "meta-JSON", MOST_BYTES, MOST_NESTING)[1]
+
+
+def _chosen(meta: ReadOnlyValues, pool_size: int) -> list[int]:
     listed = meta.get("filter_tasks")
     count = pool_size if listed is None else len(listed)
     count = min(count, meta.get("num_tasks", count))
@@ -123,28 +137,6 @@ def _chosen(meta: NamedValues, pool_size: int) -> list[int]:
     return numbers
 
 
-def _labels(meta: NamedValues, tasks: Sequence[Task], numbers: list[int]) -> Protocol:
-    by_place = meta.get("label_by_curriculum_index", meta.get("task_label_mode") == "curriculum_index")
-    labels = meta.get("task_label_ids", list(range(len(numbers))) if by_place else numbers)
-    length = meta["label_dim"]
-    require(
-        (len(labels) == len(tasks), f"task_label_ids must be one for each of {len(tasks)} tasks, got {len(labels)}"),
-        (max(labels) < length, f"label_dim must be at least {max(labels) + 1}, one more than a label, got {length}"),
-    )
-    ids = tuple(one_id_each(tuple(tasks), labels).values())
-    return Protocol("one_hot", num_task_ids=length, task_ids=ids)
-
-
-def _read(path: Path) -> NamedValues:
-    with _named(path):
-        try:
-            content = json_value(read_regular(path, MOST_BYTES), finite=False, nesting=MOST_NESTING)
-        except OSError as error:
-            raise ValueError(f"must be a file that can be read: {error.strerror or error}") from error
-        require((isinstance(content, dict), f"must hold a JSON object, got {type(content).__name__}"))
-    return content
-
-
 def _within(folder: Path, name: str) -> Path:
     path = folder / name
     inside = "\0" not in name and path.resolve().is_relative_to(folder.resolve())
@@ -152,21 +144,7 @@ def _within(folder: Path, name: str) -> Path:
     return path
 
 
-@contextmanager
-def _named(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except ValueError as error:
-        if isinstance(error, FileError):
-            raise
-        raise FileError(f"{path}: {error}") from error
-
-
-class FileError(ValueError):
-    """The error of a file, its path in front."""
-
-
-def _key_rules(meta: NamedValues) -> list[Rule]:
+def _key_rules(meta: ReadOnlyValues) -> list[Rule]:
     known = (*REQUIRED, *OPTIONAL)
     unknown = [key for key in meta if key not in known]
     near = [f"; did you mean {match!r}?" for key in unknown for match in get_close_matches(key, known, 1)]
@@ -177,7 +155,7 @@ def _key_rules(meta: NamedValues) -> list[Rule]:
     ]
 
 
-def _value_rules(meta: NamedValues) -> list[Rule]:
+def _value_rules(meta: ReadOnlyValues) -> list[Rule]:
     paths = meta["config_paths"]
     order = meta["task_order"]
     by_place = meta.get("label_by_curriculum_index", False)

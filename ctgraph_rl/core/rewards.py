@@ -49,7 +49,7 @@ class Needle:
     """1 at the goal and 0 at every other end state: the needle in a haystack of the paper, section 2.5."""
 
     def __call__(self, arrival: Arrival) -> Tensor:
-        """See `RewardFn`."""
+        """Return 1 at the goal, else 0."""
         return (arrival.leaf == arrival.goal_leaf).to(torch.float32)
 
     def bounds(self, branching_factor: int) -> tuple[float, float]:
@@ -66,7 +66,7 @@ class Gradient:
     """
 
     def __call__(self, arrival: Arrival) -> Tensor:
-        """See `RewardFn`."""
+        """Return 1 less the weighted distance."""
         b = arrival.branching_factor
         depth = arrival.depth
         place = torch.arange(arrival.max_depth, device=b.device)
@@ -87,7 +87,7 @@ class ReferenceLinear:
     """
 
     def __call__(self, arrival: Arrival) -> Tensor:
-        """See `RewardFn`."""
+        """Return 1 less the weighted distance, in shares of the largest for b=2."""
         place = torch.arange(1, arrival.max_depth + 1, device=arrival.leaf.device)
         depth = arrival.depth
         lost = (place * arrival.differences()).sum(-1)  # the last decision weighs 1, the first one d
@@ -101,5 +101,5 @@ class ReferenceLinear:
 KERNEL_REWARDS = (Needle, Gradient, ReferenceLinear)
 """The rewards that ``kernel.c`` computes, in its order; any other one, a user's own too, needs the tensor engine."""
 
-REWARD_FNS = {"needle": Needle, "gradient": Gradient, "reference_linear": ReferenceLinear}
+REWARD_FNS: dict[str, type] = {"needle": Needle, "gradient": Gradient, "reference_linear": ReferenceLinear}
 """Every reward of this package by the name that settings have; JSON names them by their classes."""

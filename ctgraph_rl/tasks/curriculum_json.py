@@ -12,8 +12,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from difflib import get_close_matches
 from itertools import chain
@@ -26,7 +25,7 @@ from ctgraph_rl.checks import NamedValues, ReadOnlyValues, are_ints, by_name, is
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import REWARD_FNS
 from ctgraph_rl.disk import write_whole
-from ctgraph_rl.strict import json_object
+from ctgraph_rl.strict import json_object, within
 from ctgraph_rl.tasks.images import IMAGE_SETS
 from ctgraph_rl.tasks.kinds.frozen_arguments import DictArgument, TupleArgument, from_json
 from ctgraph_rl.tasks.kinds.gym_task import GymTask
@@ -102,7 +101,7 @@ def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = 
         "evaluation": _plain(curriculum.evaluation, places),
         "protocol": _plain(curriculum.protocol, places),
     }
-    with _within(curriculum.name):
+    with within(curriculum.name):
         _check_form(content)
     about = []
     for label, task in zip(curriculum.labels, curriculum.tasks, strict=True):
@@ -123,7 +122,7 @@ def read_curriculum(path_or_dict: str | PathLike[str] | ReadOnlyValues, make: Ca
     source, content = json_object(path_or_dict, "curriculum", MAX_BYTES, MAX_NESTING)  # `_check_form` knows numbers
     content = dict(content)
     content.pop(_DERIVED, None)
-    with _within(source):
+    with within(source):
         _check_form(content)
         schema = content.get("schema")
         newer = f"schema {schema} is newer than {SCHEMA}, the newest that is known here; update ctgraph_rl"
@@ -133,9 +132,9 @@ def read_curriculum(path_or_dict: str | PathLike[str] | ReadOnlyValues, make: Ca
         require((isinstance(content["source"], str), f"source must be a text, got {content['source']!r:.80}"))
         tasks = _each("tasks", content["tasks"], _task)
         blocks = _each("blocks", content["blocks"], lambda block: _built(Block, block, tasks))
-        with _within("evaluation"):
+        with within("evaluation"):
             evaluation = _built(Evaluation, content["evaluation"], tasks)
-        with _within("protocol"):
+        with within("protocol"):
             protocol = _built(Protocol, content["protocol"])
         name = content["name"]
         curriculum = make(name, content["version"], content["source"], tuple(blocks), evaluation, protocol=protocol)
@@ -192,20 +191,12 @@ def _text(value: Any, margin: str = "\n") -> str:
     return json.dumps(value, allow_nan=False)
 
 
-@contextmanager
-def _within(place: str) -> Iterator[None]:
-    try:
-        yield
-    except ValueError as error:
-        raise ValueError(f"{place}: {error}") from error
-
-
 def _check_form(value: Any, nesting: int = 1) -> None:
     """Refuse what is no JSON, nested too deeply, or no number of 64 bits."""
     if isinstance(value, (Mapping, list)):
         require((nesting <= MAX_NESTING, f"nested more than {MAX_NESTING} deep"))
         for key, item in value.items() if isinstance(value, Mapping) else enumerate(value):
-            with _within(str(key)):
+            with within(str(key)):
                 _check_form(item, nesting + 1)
         return
     require(
@@ -261,7 +252,7 @@ def _each(name: str, content: Any, read: Callable[[Any], Any]) -> list[Any]:
     require((isinstance(content, list), f"{name} must be a list, got {content!r:.80}"))
     items = []
     for i, item in enumerate(content):
-        with _within(f"{name}[{i}]"):
+        with within(f"{name}[{i}]"):
             items.append(read(item))
     return items
 
@@ -272,7 +263,7 @@ def _built(kind: type, content: Any, tasks: Sequence[TaskLike] = ()) -> Any:
     _check_keys(content, [name for name in _names(kind) if name not in added], added)
     arguments = {}
     for name, item in content.items():
-        with _within(name):
+        with within(name):
             arguments[name] = _field((kind, name), item, tasks)
     return kind(**arguments)
 

@@ -66,7 +66,7 @@ class ByEpisode(_ForEpisodes):
     together: bool = False
 
     def next_task(self, task: Tensor, clock: Tensor, num_tasks: int, words: tuple[Tensor, ...]) -> Tensor:
-        """See `Switch`."""
+        """Return the task whose turn it is."""
         return clock // self.episodes % num_tasks
 
 
@@ -91,7 +91,7 @@ class AtRandom:
         object.__setattr__(self, "prob", float(self.prob))
 
     def next_task(self, task: Tensor, clock: Tensor, num_tasks: int, words: tuple[Tensor, ...]) -> Tensor:
-        """See `Switch`."""
+        """Return the same task, or with the probability another one."""
         other = (task + 1 + randint(words[1], num_tasks - 1)) % num_tasks
         return torch.where(words[0] < int(self.prob * 2**32), other, task)
 
@@ -111,7 +111,7 @@ class Drift(_ForEpisodes):
     together: bool = False
 
     def next_task(self, task: Tensor, clock: Tensor, num_tasks: int, words: tuple[Tensor, ...]) -> Tensor:
-        """See `Switch`."""
+        """Return the task of the clock, or as often as the drift has come to it the next one."""
         is_next = randint(words[0], self.episodes) < clock % self.episodes
         return (clock // self.episodes + is_next).clamp_max(num_tasks - 1)
 

@@ -235,14 +235,14 @@ def test_a_missing_key_is_named(tmp_path, key):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('{"filter_tasks": [1, 2,]}', r"mine.json: (Illegal trailing comma|Expecting value)"),
-        ("[1, 2]", "mine.json: must hold a JSON object, got list"),
-        ("", "mine.json: Expecting value"),
-        ("[" * 200_000, "mine.json: (nested more than 8 deep|Expecting value)"),
-        ('{"config_paths": ' + "[" * 50 + "]" * 50 + "}", "mine.json: nested more than 8 deep"),
-        ('{"config_paths": ' + "[" * 100_000 + "]" * 100_000 + "}", "mine.json: nested more than 8 deep"),
+        ('{"filter_tasks": [1, 2,]}', r"mine.json must be JSON: (Illegal trailing comma|Expecting value)"),
+        ("[1, 2]", "mine.json must hold a JSON object, got list"),
+        ("", "mine.json must be JSON: Expecting value"),
+        ("[" * 200_000, "mine.json must be JSON: (nested more than 8 deep|Expecting value)"),
+        ('{"config_paths": ' + "[" * 50 + "]" * 50 + "}", "mine.json must be JSON: nested more than 8 deep"),
+        ('{"config_paths": ' + "[" * 100_000 + "]" * 100_000 + "}", "mine.json must be JSON: nested more than 8 deep"),
         (" " * (MOST_BYTES + 1), "mine.json has 4,194,305 bytes, the limit is 4,194,304"),
-        ('{"label_dim": ' + "9" * 5000 + "}", "mine.json: an integer has 5,000 digits"),
+        ('{"label_dim": ' + "9" * 5000 + "}", "mine.json must be JSON: an integer has 5,000 digits"),
     ],
 )
 def test_text_that_is_no_such_file_is_refused(tmp_path, text, message):
@@ -251,9 +251,9 @@ def test_text_that_is_no_such_file_is_refused(tmp_path, text, message):
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(ValueError, match=r"none.json: must be a file that can be read: No such file"):
+    with pytest.raises(ValueError, match=r"none.json must be a JSON file that can be read: .*No such file"):
         curricula.from_meta_json(tmp_path / "none.json", 512)
-    with pytest.raises(ValueError, match=r"envs/none.json: must be a file that can be read: No such file"):
+    with pytest.raises(ValueError, match=r"envs/none.json must be a JSON file that can be read: .*No such file"):
         curricula.from_meta_json(write(tmp_path, meta("none")), 512)
 
 
