@@ -19,7 +19,6 @@ from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.tasks.configurations import OBSERVABILITY as OBSERVABILITY
 from ctgraph_rl.tasks.configurations import observations_of
 from ctgraph_rl.tasks.images import ImageSet, PaperImages
-from ctgraph_rl.tasks.observations import Observations
 from ctgraph_rl.tasks.task import Task
 from curricula.draws import below, different, generator
 from curricula.order import MOST_TASKS, OneOrMore, Tasks, each
@@ -139,7 +138,13 @@ def shifted_ids(tasks: OneOrMore, shifts: Iterable[int], kinds: Sequence[str] = 
     require((not unknown, f"kinds must be some of {', '.join(MOVABLE)}, got {', '.join(unknown)}"))
 
     def vary(task: Task) -> list[Task]:
-        shown = [_shifted(task.observations, shift, moved) for shift in listed]
+        shown = []
+        for shift in listed:
+            ids: NamedValues = {}
+            for kind in moved:
+                first, last = task.observations.ids(StateType[kind.upper()])
+                ids[f"{kind}_ids"] = first + shift, last + shift
+            shown.append(replace(task.observations, **ids))
         images = _with_room(task.images, max(observations.last_id for observations in shown) + 1)
         return [replace(task, observations=observations, images=images) for observations in shown]
 
@@ -298,7 +303,15 @@ def random_tasks(
     goals = sum(CTGraph(b, d).num_end_states for b, d in itertools.product(*choices[:2]))
     _check_draws("num_tasks", num_tasks, goals * prod(map(len, choices[2:])))
     source = generator(seed)
-    return tuple(different(num_tasks, lambda: _random_task(choices, source)))
+
+    def draw() -> Task:
+        b, d, p, kind, image_seed = (choice[below(source, len(choice))] for choice in choices)
+        graph = CTGraph(b, d, p)
+        observations = observations_of(graph, kind)
+        goal = _random_goal(graph, source)
+        return Task(graph, goal, observations, PaperImages(observations.last_id + 1, image_seed))
+
+    return tuple(different(num_tasks, draw))
 
 
 def _check_draws(name: str, wanted: object, available: int) -> None:
@@ -308,22 +321,6 @@ def _check_draws(name: str, wanted: object, available: int) -> None:
 
 def _random_goal(graph: CTGraph, source: random.Random) -> tuple[int, ...]:
     return tuple(1 + below(source, graph.branching_factor) for _ in range(graph.depth))
-
-
-def _random_task(choices: Sequence[Sequence[Any]], source: random.Random) -> Task:
-    b, d, p, kind, seed = (choice[below(source, len(choice))] for choice in choices)
-    graph = CTGraph(b, d, p)
-    observations = observations_of(graph, kind)
-    goal = _random_goal(graph, source)
-    return Task(graph, goal, observations, PaperImages(observations.last_id + 1, seed))
-
-
-def _shifted(observations: Observations, shift: int, kinds: Sequence[str]) -> Observations:
-    ids: NamedValues = {}
-    for kind in kinds:
-        first, last = observations.ids(StateType[kind.upper()])
-        ids[f"{kind}_ids"] = first + shift, last + shift
-    return replace(observations, **ids)
 
 
 def _with_room(images: ImageSet, num_images: int, exact: bool = False) -> ImageSet:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ctgraph_rl.checks import is_int, is_real, require, true_or_false
-from ctgraph_rl.core.graph import CTGraph, StateType
+from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.tasks.configurations import observations_of
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import PaperImages
@@ -52,31 +52,28 @@ def co_hard(
         (is_int(depth, 1, MOST_DEPTH), f"depth must be an integer in 1..{MOST_DEPTH}, got {depth!r}"),
         *true_or_false(unique_decisions=unique_decisions),
     )
-    p = wait_prob if expected_length is None else _wait_prob(depth, expected_length)
+    p = wait_prob
+    if expected_length is not None:
+        least = CTGraph(2, depth).expected_episode_length
+        rule = f"expected_length must be a number >= {least:g} at depth {depth}, got {expected_length!r}"
+        require((is_real(expected_length) and least <= expected_length, rule))
+        waits = (expected_length - least) / (depth + 1)  # E[rho] = 2 (d + 1) + (d + 1) p / (1 - p)
+        p = waits / (1 + waits)
     graph = CTGraph(2, depth, p)
-    observations = observations_of(graph, "confounding", num_wait_images)
-    observations = _with_unique_decisions(observations, graph) if unique_decisions else observations
-    observations = replace(observations, read_noise=read_noise)
+    observations = replace(observations_of(graph, "confounding", num_wait_images), read_noise=read_noise)
+    if unique_decisions:
+        observations = _with_unique_decisions(observations, graph.num_decision_states)
     goal = tuple(1 + place % 2 for place in range(depth))
     task = Task(graph, goal, observations, PaperImages(observations.last_id + 1, image_seed))
     return sequence("co_hard", [task], num_frames, source=SOURCE)
 
 
-def _wait_prob(depth: int, expected_length: float) -> float:
-    """Return the p with E[rho] = 2 (d + 1) + (d + 1) p / (1 - p)."""
-    least = CTGraph(2, depth).expected_episode_length
-    rule = f"expected_length must be a number >= {least:g} at depth {depth}, got {expected_length!r}"
-    require((is_real(expected_length) and least <= expected_length, rule))
-    waits = (expected_length - least) / (depth + 1)
-    return waits / (1 + waits)
-
-
-def _with_unique_decisions(observations: Observations, graph: CTGraph) -> Observations:
+def _with_unique_decisions(observations: Observations, count: int) -> Observations:
     """Return observations with an image for each decision state; the ids of waits and ends move up to make room."""
-    more = graph.num_decision_states - 1
-    (first, last), (wait, last_wait), (end, last_end) = (
-        observations.ids(kind) for kind in (StateType.DECISION, StateType.WAIT, StateType.END)
-    )
+    more = count - 1
+    first, last = observations.decision_ids
+    wait, last_wait = observations.wait_ids
+    end, last_end = observations.end_ids
     return replace(
         observations,
         decision_ids=(first, last + more),

@@ -73,12 +73,10 @@ def from_meta_json(path: str | PathLike[str], num_frames: int | Sequence[int], n
         labels = meta.get("task_label_ids", list(range(len(numbers))) if by_place else numbers)
         length = meta["label_dim"]
         count = len(tasks)
+        least = max(labels) + 1
         require(
             (len(labels) == count, f"task_label_ids must be one for each of {count} tasks, got {len(labels)}"),
-            (
-                max(labels) < length,
-                f"label_dim must be at least {max(labels) + 1}, one more than a label, got {length}",
-            ),
+            (least <= length, f"label_dim must be at least {least}, one more than a label, got {length}"),
         )
         ids = tuple(one_id_each(tuple(tasks), labels).values())
         protocol = Protocol("one_hot", num_task_ids=length, task_ids=ids)

@@ -56,9 +56,18 @@ class Region:
         if not captures(next(iter(self._arguments.values())).device):
             self._run()
         elif self.graph is None and self._calls <= WARM_UP:
-            self._warm_up()
+            stream = torch.cuda.Stream()  # another stream than the usual one, as a capture has
+            usual = torch.cuda.current_stream()
+            stream.wait_stream(usual)
+            with torch.cuda.stream(stream):
+                self._run()
+            usual.wait_stream(stream)
         else:
-            self.graph = self.graph or self._captured()
+            if self.graph is None:
+                graph = torch.cuda.CUDAGraph()
+                with torch.cuda.graph(graph):
+                    self._results = dict(self.function(dict(self._arguments)))  # in the memory of the graph
+                self.graph = graph
             self.graph.replay()
         return dict(self._results)
 
@@ -74,21 +83,6 @@ class Region:
 
     def _run(self) -> None:
         self._write(self._results, self.function(dict(self._arguments)))
-
-    def _warm_up(self) -> None:
-        """Run the function on another stream than the usual one, as a capture does."""
-        stream = torch.cuda.Stream()
-        usual = torch.cuda.current_stream()
-        stream.wait_stream(usual)
-        with torch.cuda.stream(stream):
-            self._run()
-        usual.wait_stream(stream)
-
-    def _captured(self) -> torch.cuda.CUDAGraph:
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
-            self._results = dict(self.function(dict(self._arguments)))
-        return graph
 
     @staticmethod
     def _write(buffers: OwnTensors, values: Tensors) -> None:

@@ -188,7 +188,10 @@ def _pairs(matrix: Tensor, chosen: Callable[[Tensor, Tensor], Tensor]) -> Tensor
 def _changes_by_others(performance: Tensor, trained: Trained | None, scale: Tensor | None, before: bool) -> Tensor:
     """(R[j, i] - R[j-1, i]) / scale[i] for blocks j before, or after, the first one that trains i."""
     tasks = performance.shape[1]
-    alone = _alone(performance, trained)
+    blocks = _blocks(performance, trained)
+    if any(len(block) != 1 for block in blocks):
+        raise Undefined("the definition needs blocks that train one task each")
+    alone = [block[0] for block in blocks]
     if tasks == 1:
         raise Undefined(ONE_TASK)
     scale = performance.nan_to_num(0).abs().amax(dim=0) if scale is None else scale
@@ -200,13 +203,6 @@ def _changes_by_others(performance: Tensor, trained: Trained | None, scale: Tens
     others = block.new_tensor(alone) != torch.arange(tasks, device="cpu").unsqueeze(1)
     chosen = others & ((block < first) == before)
     return changes.T[chosen]
-
-
-def _alone(performance: Tensor, trained: Trained | None) -> list[int]:
-    blocks = _blocks(performance, trained)
-    if any(len(block) != 1 for block in blocks):
-        raise Undefined("the definition needs blocks that train one task each")
-    return [block[0] for block in blocks]
 
 
 def _several_in_order(performance: Tensor, trained: Trained | None) -> None:

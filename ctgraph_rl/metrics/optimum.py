@@ -134,16 +134,15 @@ def search_efficiency(
 
 def _at_first_success(counts: Sequence[Tensor], episodes: Sequence[Tensor], success_rates: Sequence[Tensor]) -> Tensor:
     """For each task, the count at the first success, float64 [tasks]; NaN without one."""
-    tasks = zip(counts, episodes, success_rates, strict=True)
-    return float64([_count_at_first_success(*task) for task in tasks])
-
-
-def _count_at_first_success(counts: Tensor, episodes: Tensor, success_rates: Tensor) -> float:
-    found = (success_rates > 0).nonzero().flatten().tolist()
-    if not found:
-        return math.nan
-    i = found[0]
-    before = counts[found[0] - 1].item() if found[0] else 0
-    played = episodes[i].item()
-    position = (played + 1) / (round(played * success_rates[i].item()) + 1)
-    return before + (counts[i].item() - before) * position / played
+    first = []
+    for count, played, rates in zip(counts, episodes, success_rates, strict=True):
+        found = (rates > 0).nonzero().flatten().tolist()
+        if not found:
+            first.append(math.nan)
+            continue
+        i = found[0]
+        before = count[i - 1].item() if i else 0
+        finished = played[i].item()
+        position = (finished + 1) / (round(finished * rates[i].item()) + 1)
+        first.append(before + (count[i].item() - before) * position / finished)
+    return float64(first)

@@ -7,7 +7,7 @@ curriculum; its curve is an argument.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import torch
@@ -46,14 +46,13 @@ def stage_areas(curves: Curves, trapezoids: bool = False) -> Tensor:
         trapezoids: `trapezoid_area` instead of `mean_area`.
     """
     area = trapezoid_area if trapezoids else mean_area
-    return torch.stack([_area_or_nan(curves, task, area) for task in range(curves.performance.shape[1])])
-
-
-def _area_or_nan(curves: Curves, task: int, area: Callable[[Tensor], Tensor]) -> Tensor:
-    try:
-        return area(curves.own_stage(task))
-    except Undefined:
-        return curves.performance.new_tensor(torch.nan)
+    areas = []
+    for task in range(curves.performance.shape[1]):
+        try:
+            areas.append(area(curves.own_stage(task)))
+        except Undefined:
+            areas.append(curves.performance.new_tensor(torch.nan))
+    return torch.stack(areas)
 
 
 def _no_transfer(areas: Tensor, expert_areas: Tensor, smallest_headroom: float = 0.0) -> str:

@@ -6,7 +6,7 @@ import hashlib
 import json
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from functools import cached_property
 from html import escape
@@ -90,11 +90,16 @@ class Curriculum:
     def _repr_html_(self) -> str:
         """Return what a notebook shows: a table of the first blocks."""
         labels = dict(zip(self.tasks, self.labels, strict=True))
-        head = "<th>block</th><th>tasks</th><th>b, d, p</th><th>frames</th>"
-        rows = [_block_html(number, block, labels) for number, block in enumerate(self.blocks[:SHOWN], 1)]
+        rows = ["<tr><th>block</th><th>tasks</th><th>b, d, p</th><th>frames</th></tr>"]
+        for number, block in enumerate(self.blocks[:SHOWN], 1):
+            names = [labels[task] for task in dict.fromkeys(block.tasks)]
+            graphs = dict.fromkeys(task.graph for task in block.tasks if isinstance(task, Task))
+            shapes = [f"{graph.branching_factor}, {graph.depth}, {graph.wait_prob:g}" for graph in graphs]
+            cells = (str(number), _some(names), _some(shapes, "; "), f"{block.num_frames:,}")
+            rows.append(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in cells)}</tr>")
         more = f"<p>and {len(self.blocks) - SHOWN:,} more blocks</p>" if len(self.blocks) > SHOWN else ""
         source = escape(f"{self._summary}. {self.source}")
-        return f"<p>{source}</p><table><tr>{head}</tr>{''.join(rows)}</table>{more}"
+        return f"<p>{source}</p><table>{''.join(rows)}</table>{more}"
 
     @property
     def _summary(self) -> str:
@@ -235,18 +240,6 @@ class Curriculum:
         content = {**_canonical(self), "name": "-", "source": "-"}
         text = json.dumps([FINGERPRINT_SCHEMA, content], sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def _block_html(number: int, block: Block, labels: Mapping[TaskLike, str]) -> str:
-    names = []
-    shapes = {}
-    for task in dict.fromkeys(block.tasks):
-        names.append(labels[task])
-        if isinstance(task, Task):
-            graph = task.graph
-            shapes[graph] = f"{graph.branching_factor}, {graph.depth}, {graph.wait_prob:g}"
-    cells = (str(number), _some(names), _some(list(shapes.values()), "; "), f"{block.num_frames:,}")
-    return f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in cells)}</tr>"
 
 
 def _some(names: Sequence[str], between: str = ", ") -> str:

@@ -90,13 +90,18 @@ def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = 
     require((path is None or not lexists(path), f"{path} exists: choose another path, nothing is overwritten"))
     tasks = (*curriculum.tasks, *curriculum.evaluation.held_out)
     places: dict[TaskLike, int] = {task: i for i, task in enumerate(tasks)}
+    listed = []
+    for task in places:
+        kind = type(task)
+        named = {} if kind is Task else {"type": type_name(kind)}
+        listed.append(named | {name: _plain(getattr(task, name), {}) for name in _names(kind)})
     content: NamedValues = {
         "schema": SCHEMA,
         "fingerprint": curriculum.fingerprint,
         "name": curriculum.name,
         "version": curriculum.version,
         "source": curriculum.source,
-        "tasks": [_task_as_json(task) for task in places],
+        "tasks": listed,
         "blocks": _plain(curriculum.blocks, places),
         "evaluation": _plain(curriculum.evaluation, places),
         "protocol": _plain(curriculum.protocol, places),
@@ -157,13 +162,6 @@ def _plain(value: Any, places: Mapping[TaskLike, int]) -> Any:
     require((kind in _OURS, f"JSON holds only types of this package, got {value!r}; exchange it as Python"))
     content: NamedValues = {"type": kind.__name__} if kind in _NAMED_TYPES else {}
     return content | {name: _plain(getattr(value, name), places) for name in _names(kind)}
-
-
-def _task_as_json(task: TaskLike) -> NamedValues:
-    """Return a task as JSON; a kind beside `Task` is named."""
-    kind = type(task)
-    content: NamedValues = {} if kind is Task else {"type": type_name(kind)}
-    return content | {name: _plain(getattr(task, name), {}) for name in _names(kind)}
 
 
 def type_name(kind: type) -> str:

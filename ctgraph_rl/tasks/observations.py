@@ -79,11 +79,14 @@ class Observations:
                     ranges[name] = value
             elif "bool" in field.type:
                 flags[name] = value
+        ordered = sorted(ranges.items(), key=lambda item: item[1])
+        for (low_name, low), (high_name, high) in combinations(ordered, 2):
+            overlaps = f"{high_name}={high} overlaps {low_name}={low}; let it start at {low[1] + 1} or later"
+            rules.append((high[0] > low[1], overlaps))
         rotation = self.read_rotation
         degrees = f"read_rotation must be whole degrees in 0..{MAX_READ_ROTATION}, got {rotation!r}"
         require(
             *rules,
-            *_overlap_rules(ranges),
             *true_or_false(**flags),
             (is_int(self.read_noise, 0, 255), f"read_noise must be an integer in 0..255, got {self.read_noise!r}"),
             (is_int(rotation, 0, MAX_READ_ROTATION), degrees),
@@ -127,11 +130,3 @@ class Observations:
 
 def _is_range(value: object) -> TypeGuard[Ids]:
     return isinstance(value, tuple) and len(value) == 2 and is_int(value[0], 0) and is_int(value[1], value[0])
-
-
-def _overlap_rules(ranges: dict[str, Ids]) -> list[Rule]:
-    ordered = sorted(ranges.items(), key=lambda item: item[1])
-    return [
-        (high[0] > low[1], f"{high_name}={high} overlaps {low_name}={low}; let it start at {low[1] + 1} or later")
-        for (low_name, low), (high_name, high) in combinations(ordered, 2)
-    ]

@@ -78,7 +78,10 @@ def read_task(path_or_dict: str | PathLike[str] | ReadOnlyValues, goal: Sequence
     draws = "the authors' implementation draws one at random or sets it with set_high_reward_path, counting from 0"
     fix = "add 1 to each entry of its path, such as goal=(1, 2) for [0, 1]"
     require((goal is not None, f"goal is not in the file and must be given: {draws}; {fix}"))
-    dialect = _dialect(content)
+    given = set(_given(content))
+    dialect = max(
+        reversed(_DIALECTS), key=lambda name: len(given & set(_places(name).values()))
+    )  # the newest of several
     require(*((False, f"{source}: {fault}") for fault in _faults(content, dialect)))
     places = _places(dialect)
     found = {name: content[section][key] for name, (section, key) in places.items()}
@@ -105,12 +108,6 @@ def _given(content: ReadOnlyValues) -> list[tuple[str, str]]:
     return given
 
 
-def _dialect(content: ReadOnlyValues) -> str:
-    """The dialect that has most of the keys, the newest of several."""
-    given = set(_given(content))
-    return max(reversed(_DIALECTS), key=lambda dialect: len(given & set(_places(dialect).values())))
-
-
 def _faults(content: ReadOnlyValues, dialect: str) -> Iterator[str]:
     names = (*_SECTIONS, "general_seed")
     for name in content:
@@ -122,16 +119,13 @@ def _faults(content: ReadOnlyValues, dialect: str) -> Iterator[str]:
     wanted = _places(dialect).values()
     given = _given(content)
     for section, key in given:
-        if (section, key) not in wanted and not _says_nothing(section, key, content):
+        is_switch = (section, key) == ("reward", "stochastic_sampling")  # files of 2023 may keep the older one of noise
+        says_nothing = is_switch and content["reward"].get("std_r") == 0
+        if (section, key) not in wanted and not says_nothing:
             yield _surplus(section, key, dialect)
     for section, key in wanted:
         if isinstance(content.get(section), Mapping) and (section, key) not in given:
             yield f"{section}.{key} is missing"
-
-
-def _says_nothing(section: str, key: str, content: ReadOnlyValues) -> bool:
-    """Files of 2023 may keep the older switch of reward noise; without noise it has no meaning."""
-    return (section, key) == ("reward", "stochastic_sampling") and content["reward"].get("std_r") == 0
 
 
 def _surplus(section: str, key: str, dialect: str) -> str:

@@ -80,7 +80,17 @@ def state_agreement(tasks: Sequence[Task], gamma: float = 1.0) -> Tensor:
     Raises:
         ValueError: for rewards other than `Needle` beyond `values.MAX_ENUMERATED_STATES` states.
     """
-    return _matrix(_choices(_tasks(tasks), gamma), _equal_share)
+
+    def share(one: _Choices, other: _Choices) -> float:
+        tree = _common(one.task, other.task)
+        count = _equal_on_ways if one.collapsed and other.collapsed else _equal_everywhere
+        equal = 0
+        for kind in CHOOSING:
+            for level in range(tree.depth + (kind == StateType.WAIT)):
+                equal += count(one, other, kind, level, tree.branching_factor)
+        return equal / (tree.num_decision_states + tree.num_wait_states)
+
+    return _matrix(_choices(_tasks(tasks), gamma), share)
 
 
 def observation_agreement(tasks: Sequence[Task], gamma: float = 1.0) -> Tensor:
@@ -104,7 +114,14 @@ def observation_agreement(tasks: Sequence[Task], gamma: float = 1.0) -> Tensor:
         shown = one.keys() & other.keys()
         return sum(one[i] == other[i] != 0 for i in shown) / len(shown) if shown else math.nan
 
-    return _matrix([_actions_left(choice) for choice in _choices(_tasks(tasks), gamma)], share)
+    found = []
+    for choice in _choices(_tasks(tasks), gamma):
+        left: dict[bytes, int] = {}  # for each image, the actions that are optimal in all states that show it
+        for ids, actions in _shown_with_actions(choice):
+            for content in _contents(choice.task, ids):
+                left[content] = left.get(content, actions) & actions
+        found.append(left)
+    return _matrix(found, share)
 
 
 def shared_images(tasks: Sequence[Task]) -> Tensor:
@@ -248,18 +265,6 @@ def _best(values: Tensor, fails: float, num_actions: int, first: int, margin: fl
     return sets
 
 
-def _equal_share(one: _Choices, other: _Choices) -> float:
-    tree = _common(one.task, other.task)
-    b = tree.branching_factor
-    d = tree.depth
-    count = _equal_on_ways if one.collapsed and other.collapsed else _equal_everywhere
-    equal = 0
-    for kind in CHOOSING:
-        for level in range(d + (kind == StateType.WAIT)):
-            equal += count(one, other, kind, level, b)
-    return equal / (tree.num_decision_states + tree.num_wait_states)
-
-
 def _equal_on_ways(one: _Choices, other: _Choices, kind: StateType, level: int, b: int) -> int:
     """Equal states of a level: those on the ways to two needles one by one, all others at once."""
     ways = {one.task.goal[:level], other.task.goal[:level]}
@@ -270,11 +275,11 @@ def _equal_on_ways(one: _Choices, other: _Choices, kind: StateType, level: int, 
 
 
 def _equal_everywhere(one: _Choices, other: _Choices, kind: StateType, level: int, b: int) -> int:
-    def sets(choice: _Choices) -> list[int]:
+    sets = []
+    for choice in (one, other):
         nodes = _nodes(choice.task.graph.branching_factor, b, level)
-        return choice.of_nodes(kind, level, nodes)
-
-    return sum(a == z for a, z in zip(sets(one), sets(other), strict=True))
+        sets.append(choice.of_nodes(kind, level, nodes))
+    return sum(a == z for a, z in zip(*sets, strict=True))
 
 
 @lru_cache(maxsize=64)
@@ -286,15 +291,6 @@ def _nodes(own_b: int, b: int, level: int) -> list[int]:
     for node in _nodes(own_b, b, level - 1):
         nodes += range(node * own_b, node * own_b + b)
     return nodes
-
-
-def _actions_left(choice: _Choices) -> dict[bytes, int]:
-    """For each image that wait and decision states show, the actions that are optimal in all states that show it."""
-    left: dict[bytes, int] = {}
-    for ids, actions in _shown_with_actions(choice):
-        for content in _contents(choice.task, ids):
-            left[content] = left.get(content, actions) & actions
-    return left
 
 
 def _shown_with_actions(choice: _Choices) -> Iterator[tuple[Sequence[int], int]]:

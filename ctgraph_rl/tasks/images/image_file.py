@@ -72,7 +72,7 @@ class ImageFile:
         return resize(torch.from_numpy(np.array(array, order="C")).flatten(0, 1), self.shape[-1])
 
     def bank(self, read_rotation: int) -> Tensor:
-        """See `ImageSet`."""
+        """Return each image's rotations by 0, 1, ... degrees in a row, uint8 [rows, 1, r, r]."""
         return rotations(self.images, read_rotation)
 
 

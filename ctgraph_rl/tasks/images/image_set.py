@@ -71,7 +71,7 @@ class SquareImages:
         raise NotImplementedError
 
     def bank(self, read_rotation: int) -> Tensor:
-        """See `ImageSet`."""
+        """Return each image's rotations by 0, 1, ... degrees in a row, uint8 [rows, 1, r, r]."""
         return rotations(self.images, read_rotation)
 
 

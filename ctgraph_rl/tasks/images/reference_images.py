@@ -10,6 +10,7 @@ from functools import lru_cache
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from ctgraph_rl.checks import is_int, is_real, make_fields_plain, require, require_memory
 from ctgraph_rl.tasks.images.generated import BLUEPRINT_SIZE
@@ -70,8 +71,8 @@ class ReferenceImages(SquareImages):
         """uint8 [num_images, 12, 12], before noise and rotation on read."""
         return _reference_images(self)
 
+    @override
     def bank(self, read_rotation: int) -> Tensor:
-        """See `ImageSet`; rotated on read as the authors' implementation does it, pixel by pixel."""
         views = np.empty((self.num_images, read_rotation + 1, 1, self.size, self.size), dtype=np.uint8)
         images = self.images.numpy()
         for first in range(0, self.num_images, _ROTATED_AT_ONCE):

@@ -100,15 +100,24 @@ class ObservationForm:
             FloatingPointError: for numbers that are not finite.
         """
         if self.is_integer:
-            return self._read_integer(observation)
+            number = read_number(observation, "the observation")
+            place = number - int(self.space.start)
+            inside = place in range(self.shape[0])
+            require((inside, f"the observation {observation!r:.80} is not in its space {self.space}"))
+            shown = np.zeros(self.shape, dtype=np.uint8)
+            shown[int(place)] = 1
+            return shown
         array = _as_array(observation)
         require((array.dtype.kind in "biuf", f"the observation must be numbers, got {observation!r:.80}"))
         shape = self.space.shape
         alike = [size for size in array.shape if size != 1] == [size for size in shape if size != 1]
         require((alike, f"the observation has the shape {array.shape}, and its space {shape}"))
         array = array.reshape(shape)
-        if array.dtype.kind == "f":
-            _check_finite(array)
+        wrong = ~(np.abs(array).astype(np.float64) <= LARGEST)  # LARGEST is infinite as float16
+        if array.dtype.kind == "f" and wrong.any():
+            [first] = np.argwhere(wrong)[:1].tolist()
+            value = array[tuple(first)]
+            raise FloatingPointError(f"the observation is {value} at {first}, which is not finite as float32")
         if self.dtype == np.uint8 and array.dtype != np.uint8:
             with np.errstate(invalid="ignore"):
                 pixels = array.astype(np.uint8)
@@ -118,15 +127,6 @@ class ObservationForm:
         if self.axes is not None:
             array = array.transpose(self.axes)
         return array.reshape(self.shape).astype(self.dtype)
-
-    def _read_integer(self, observation: Any) -> NDArray[Any]:
-        number = read_number(observation, "the observation")
-        place = number - int(self.space.start)
-        inside = place in range(self.shape[0])
-        require((inside, f"the observation {observation!r:.80} is not in its space {self.space}"))
-        shown = np.zeros(self.shape, dtype=np.uint8)
-        shown[int(place)] = 1
-        return shown
 
     def read_first(self, returned: Any) -> NDArray[Any]:
         """Return the observation of what ``reset`` returned."""
@@ -246,14 +246,6 @@ def _as_array(value: Any) -> NDArray[Any]:
         return np.asarray(plain(value))
     except (TypeError, ValueError):
         return np.asarray(None)
-
-
-def _check_finite(array: NDArray[Any]) -> None:
-    wrong = ~(np.abs(array).astype(np.float64) <= LARGEST)  # LARGEST is infinite as float16
-    if wrong.any():
-        [place] = np.argwhere(wrong)[:1].tolist()
-        value = array[tuple(place)]
-        raise FloatingPointError(f"the observation is {value} at {place}, which is not finite as float32")
 
 
 def _is_shown_rule(space: Any) -> tuple[bool, str]:

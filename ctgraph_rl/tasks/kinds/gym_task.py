@@ -162,7 +162,11 @@ class GymTask:
             try:
                 env = gymnasium.make(self.id, self.max_episode_steps, disable_env_checker=True, **kwargs)
                 for wrapper in self.wrappers:
-                    env = _wrapped(env, wrapper)
+                    name, arguments = (wrapper, ()) if isinstance(wrapper, str) else wrapper
+                    wrapped = load_object(name)(env, **{key: thaw(value) for key, value in arguments})
+                    is_env = isinstance(wrapped, gymnasium.Env)
+                    require((is_env, f"the wrapper {name} must return a gymnasium.Env, got {wrapped!r:.80}"))
+                    env = wrapped
             except Exception as error:  # of an environment of anyone
                 raise ValueError(f"GymTask({self.id!r}) cannot be made: {type(error).__name__}: {error}") from error
             limit = "has no time limit, so an episode may never end: give max_episode_steps"
@@ -182,7 +186,12 @@ class GymTask:
         """
         if self.return_range is not None and gamma == 1:
             return self.return_range[1]
-        return _best_mean_return(self, gamma)
+        table = _table(self)  # V_0 = 0, V_t(s) = max_a sum_o p_o (r_o + gamma V_{t-1}(s_o)), but for ends of episodes
+        values = np.zeros(len(table.initial))
+        for _ in range(table.limit):
+            after = table.rewards + gamma * (1 - table.ends) * values[table.following]
+            values = (table.probs * after).sum(-1).max(1)
+        return float(values @ table.initial)
 
     @property
     def return_bounds(self) -> tuple[float, float]:
@@ -276,19 +285,6 @@ def _read_table(task: GymTask, key: Any) -> _Table:
     return _Table(probs, following.astype(np.int64), rewards, ends, initial=initial, limit=limit)
 
 
-def _best_mean_return(task: GymTask, gamma: float) -> float:
-    """Return the best mean return within the time limit, by finite-horizon dynamic programming.
-
-    V_0 = 0 and V_t(s) = max_a sum_o p_o (r_o + gamma V_{t-1}(s_o)), without the last term where o ends the episode.
-    """
-    table = _table(task)
-    values = np.zeros(len(table.initial))
-    for _ in range(table.limit):
-        after = table.rewards + gamma * (1 - table.ends) * values[table.following]
-        values = (table.probs * after).sum(-1).max(1)
-    return float(values @ table.initial)
-
-
 def _extreme_return(task: GymTask, choose: Callable[..., Any]) -> float:
     """Return the best or the worst return that an episode can have: as above, with any outcome that is possible."""
     table = _table(task)
@@ -319,12 +315,3 @@ def _frozen_wrapper(wrapper: Any, rule: str) -> Any:
     require((found, f"the wrapper {name} has no name by which another process finds it, got {wrapper!r}: {fix}"))
     arguments = by_name(f"arguments of the wrapper {name}", given)
     return (name, arguments) if arguments else name
-
-
-def _wrapped(env: Any, wrapper: Any) -> Any:
-    from gymnasium import Env
-
-    name, arguments = (wrapper, ()) if isinstance(wrapper, str) else wrapper
-    found = load_object(name)(env, **{key: thaw(value) for key, value in arguments})
-    require((isinstance(found, Env), f"the wrapper {name} must return a gymnasium.Env, got {found!r:.80}"))
-    return found

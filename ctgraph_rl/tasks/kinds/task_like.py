@@ -81,9 +81,15 @@ def are_tasks(name: str, values: object) -> list[Rule]:
         values: a tuple, or what is none.
     """
     if not isinstance(values, tuple) or not all(map(_is_value, values)):
-        kinds = f"a task is a Task, a GymTask or a frozen dataclass with {', '.join(MEMBERS)}"
-        return [(False, f"{name}, got {values!r:.200}; {kinds}")]
-    return [*map(_task_rule, dict.fromkeys(map(type, values))), _kinds_rule(values)]
+        fix = f"a task is a Task, a GymTask or a frozen dataclass with {', '.join(MEMBERS)}"
+        return [(False, f"{name}, got {values!r:.200}; {fix}")]
+    kinds = list(dict.fromkeys(map(type, values)))
+    several = " and ".join(dict.fromkeys(kind.__name__ for kind in kinds))
+    one_kind = (
+        len(kinds) < 2,
+        f"tasks of one environment must be of one kind, got {several}; make two curricula",
+    )
+    return [*map(_task_rule, kinds), one_kind]
 
 
 def most_actions(tasks: Iterable[TaskLike]) -> int:
@@ -114,13 +120,6 @@ def _task_rule(kind: type) -> Rule:
         return False, f"{kind.__name__} is no task, it cannot be hashed: put @dataclass(frozen=True) above its class"
     fix = "see ctgraph_rl.tasks.kinds.task_like.TaskLike"
     return not missing, f"{kind.__name__} is no task, it lacks {', '.join(missing)}: {fix}"
-
-
-def _kinds_rule(tasks: Sequence[object]) -> Rule:
-    kinds = list(dict.fromkeys(type(task).__name__ for task in tasks))
-    return len(
-        kinds
-    ) < 2, f"tasks of one environment must be of one kind, got {' and '.join(kinds)}; make two curricula"
 
 
 def require_tasks(values: Iterable[TaskLike]) -> tuple[Any, ...]:
