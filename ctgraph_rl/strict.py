@@ -62,8 +62,7 @@ def json_value(content: bytes, finite: bool = True, nesting: int = MAX_NESTING) 
         nesting: most objects and lists within each other.
 
     Raises:
-        ValueError: for what is no JSON, a key that is twice in an object, an integer of too many digits, too many
-            objects and lists within each other.
+        ValueError: for what is no JSON, a key twice in an object, an integer of too many digits, and too deep nesting.
     """
     text = content.decode("utf-8")
     try:
@@ -196,11 +195,7 @@ def yaml_value(content: bytes) -> Any:
 def files_below(folder: Path, names: Sequence[str] = ()) -> tuple[list[Path], list[Path]]:
     """Return the files in or below a folder, sorted, and the folders that are too deep to look into.
 
-    Links to folders are not followed, and count as files.
-
-    Args:
-        folder: need not exist.
-        names: of the files; empty for all.
+    Links to folders count as files. ``names`` are those of the files to find; empty for all.
     """
     files = []
     deep = []

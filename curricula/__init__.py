@@ -41,7 +41,7 @@ def names() -> list[str]:
 
 
 def load(name: str, **arguments: Any) -> Curriculum:
-    """A curriculum by name, as published unless arguments change it.
+    """A curriculum by name; arguments change it.
 
     Raises:
         ValueError: for an unknown name or argument; lists the choices.

@@ -41,15 +41,7 @@ def environment(
 ) -> NamedValues:
     """A configuration file as the labs have them: b=2, p=0, one goal, reward 1, no noise; ids are consecutive.
 
-    Args:
-        depth: d.
-        wait_ids: first and last.
-        decision_ids: first and last.
-        end_ids: first and last; the last image.
-        image_seed: seed of the image set.
-        fail_reward: reward of the fail state.
-        unique: whether decision states and wait states have their own images.
-        one_hot: vectors instead of images.
+    ``unique`` says whether decision states and wait states have their own images.
     """
     return {
         "graph_shape": {"d": depth, "b": 2, "p": 0.0},
@@ -122,17 +114,7 @@ def labelled(
     num_frames: int,
     evaluation: Evaluation = MASK_EVALUATION,
 ) -> Curriculum:
-    """A block for each task, announced, with a one-hot task id.
-
-    Args:
-        name: of the curriculum.
-        source: paper and repository.
-        tasks: in order; a task may come again.
-        ids: the id of each.
-        num_task_ids: length of the one-hot id.
-        num_frames: frames of each block.
-        evaluation: how performance is measured.
-    """
+    """A block for each task, announced, with a one-hot task id of length ``num_task_ids``; a task may come again."""
     by_task = one_id_each(tasks, ids)
     protocol = Protocol("one_hot", num_task_ids=num_task_ids, task_ids=tuple(by_task.values()))
     return sequence(name, tasks, num_frames, source=source, protocol=protocol, evaluation=evaluation)
@@ -156,7 +138,7 @@ def chosen(what: str, number: int, choices: Sequence[Any]) -> Any:
     """The choice of a number counted from 0.
 
     Raises:
-        ValueError: for a number that does not exist; lists those that do.
+        ValueError: for a number that does not exist.
     """
     require((is_int(number, 0, len(choices) - 1), f"{what} must be in 0..{len(choices) - 1}, got {number!r}"))
     return choices[number]

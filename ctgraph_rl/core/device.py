@@ -29,10 +29,7 @@ def checked_device(device: object) -> torch.device:
 
 @contextmanager
 def torchs_defaults() -> Iterator[None]:
-    """Let code of others that names no dtype and no device have float32 and the CPU, whatever the user's defaults are.
-
-    Code of this package names both. Where the defaults are the usual ones, nothing is set.
-    """
+    """Let code of others that names no dtype and no device have float32 and the CPU, whatever the user's defaults."""
     dtype = torch.get_default_dtype()
     if dtype == torch.float32 and torch.get_default_device().type == "cpu":
         yield

@@ -86,7 +86,7 @@ TASK_KINDS: dict[str, type] = {GymTask.__name__: GymTask}
 
 
 def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = None) -> NamedValues:
-    """Return a curriculum as JSON; see `Curriculum.to_json`."""
+    """Return a curriculum as JSON, written into a file if a path is given."""
     require((path is None or not lexists(path), f"{path} exists: choose another path, nothing is overwritten"))
     tasks = (*curriculum.tasks, *curriculum.evaluation.held_out)
     places: dict[TaskLike, int] = {task: i for i, task in enumerate(tasks)}
@@ -123,7 +123,7 @@ def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = 
 
 
 def read_curriculum(path_or_dict: str | PathLike[str] | ReadOnlyValues, make: Callable[..., Curriculum]) -> Curriculum:
-    """Return the curriculum of a JSON file or of its content, which ``make`` makes; see `Curriculum.from_json`."""
+    """Return the curriculum of a JSON file or of its content, which ``make`` makes."""
     source, content = json_object(path_or_dict, "curriculum", MAX_BYTES, MAX_NESTING)  # `_check_form` knows numbers
     content = dict(content)
     content.pop(_DERIVED, None)

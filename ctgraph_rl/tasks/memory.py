@@ -26,7 +26,7 @@ def bank_key(task: Task) -> BankKey:
 
 
 def make_bank(key: BankKey) -> Tensor:
-    """Return all images of a key, uint8 [rows, *shape]; see `ImageSet.bank`."""
+    """Return all images of a key, uint8 [rows, *shape]."""
     images, rotation = key
     size = math.prod(images.shape) * images.num_images * images.num_variants * (rotation + 1)
     require_memory(f"{images.num_images:,} images while they are made", 2 * size, "images")

@@ -162,11 +162,10 @@ class Evaluation:
         return self.every % num_envs == 0, message
 
     def check(self, tasks: Iterable[TaskLike]) -> None:
-        """Refuse to measure changing goals by first episodes, which all have the first goal.
+        """Refuse to measure changing goals by first episodes, goals that change while a row adapts, and too many rows.
 
         Raises:
-            ValueError: for one episode a row and a task with ``goal_change``, and a goal that changes while a row
-                adapts.
+            ValueError: if tasks cannot be evaluated so.
         """
         tasks = tuple(tasks)
         changes = []
@@ -255,12 +254,7 @@ class Protocol:
 
 
 def changed(name: str, part: ProtocolPart, changes: ReadOnlyValues) -> ProtocolPart:
-    """An evaluation or a protocol with other values of some fields.
-
-    Args:
-        name: of the part, for errors.
-        part: the part.
-        changes: values by the names of fields.
+    """An evaluation or a protocol with other values of some fields; ``name`` is that of the part, for errors.
 
     Raises:
         ValueError: for a name of no field, with the one that was probably meant, and for values out of range.

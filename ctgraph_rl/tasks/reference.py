@@ -71,7 +71,7 @@ _LEGACY: NamedValues = {"reward_cue": True, "cue_wraps": True, "legacy_index": T
 
 
 def read_task(path_or_dict: str | PathLike[str] | ReadOnlyValues, goal: Sequence[int] | None) -> NamedValues:
-    """The arguments of `Task` for a configuration file; see `Task.from_json`."""
+    """Return the arguments of `Task` for a configuration file or its content."""
     source, content = json_object(path_or_dict, "configuration", MAX_BYTES)
     if is_paper_json(content):
         return read_paper_json(source, content, goal)
@@ -211,7 +211,7 @@ def _arguments(found: NamedValues) -> NamedValues:
 
 
 def write_task(task: Task, path: str | PathLike[str] | None, general_seed: int) -> NamedValues:
-    """A task as a configuration file of the 2023 dialect; see `Task.to_json`."""
+    """Return a task as a configuration file of the 2023 dialect, written if a path is given."""
     require(
         (path is None or not lexists(path), f"{path} exists: choose another path, nothing is overwritten"),
         (is_int(general_seed, 0, MAX_SEED), f"general_seed must be in [0, 2**32), got {general_seed!r}"),

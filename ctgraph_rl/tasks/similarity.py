@@ -48,8 +48,7 @@ ActionSets = dict[tuple[StateType, int], list[int]]
 def shared_decisions(tasks: Sequence[Task]) -> Tensor:
     """Decisions that two goals share from the first on, as a share of the shorter goal's; float64 [T, T].
 
-    (1, 2, 1) and (1, 2) share 1.0, (1, 2, 1) and (1, 1, 1) share 1/3. 1 means that the decisions
-    for the goal of the smaller graph are the first ones for that of the larger one.
+    (1, 2, 1) and (1, 2) share 1.0, (1, 2, 1) and (1, 1, 1) share 1/3.
 
     Example:
         >>> import curricula
@@ -96,10 +95,9 @@ def state_agreement(tasks: Sequence[Task], gamma: float = 1.0) -> Tensor:
 def observation_agreement(tasks: Sequence[Task], gamma: float = 1.0) -> Tensor:
     """The same for what a policy without memory sees: a share of the observations shown in both tasks; float64 [T, T].
 
-    Counted are the different images that wait and decision states of both tasks can show. At each, a task leaves the
-    actions that are optimal in every one of its states that can show it; the tasks agree where they leave the same
-    actions, and any at all. So the diagonal is below 1 for tasks that need memory: with one image for all decision
-    states the goal (1, 2) leaves none there. nan where no image is shown in both.
+    For each image that wait and decision states of both tasks can show, a task leaves the actions that are optimal in
+    all of its states that can show it. Tasks agree where they leave the same actions, and any at all. So the diagonal
+    is below 1 for tasks that need memory. nan where no image is shown in both.
 
     Args:
         tasks: any tasks.

@@ -176,7 +176,7 @@ class Task:
 
     @classmethod
     def make_env(cls, tasks: Sequence[Task], seed: int = 0, **settings: Any) -> Any:
-        """Return a `ctgraph_rl.CTGraphEnv` with one row for each of ``tasks``; see `TaskLike`."""
+        """Return a `ctgraph_rl.CTGraphEnv` with one row for each of ``tasks``."""
         return environment(Task)(tasks, seed, **settings)
 
     def _check_parts(self) -> None:
@@ -263,30 +263,30 @@ class Task:
 
     @takes_numbers
     def optimal_value(self, gamma: float) -> float:
-        """The best expected discounted return from the home state; see `values.optimal_value`."""
+        """The best expected discounted return from the home state; gamma in [0, 1]."""
         return values.optimal_value(self, gamma)
 
     @takes_numbers
     def policy_value(self, policy: Tensor, gamma: float = 1.0) -> float:
-        """The expected discounted return of action probabilities per observation id; see `values.policy_value`."""
+        """The expected discounted return of action probabilities per observation id, float [num_images, A]."""
         return values.policy_value(self, policy, gamma)
 
     def success_prob(self, policy: Tensor) -> float:
-        """The probability that such a policy reaches the goal; see `values.success_prob`."""
+        """The probability that such a policy reaches the goal."""
         return values.success_prob(self, policy)
 
     def memoryless_ceiling(self, deterministic: bool = False) -> float:
-        """The best mean return of a policy that remembers nothing; see `values.memoryless_ceiling`."""
+        """The best mean return of a policy that remembers nothing; of needles, see `values.memoryless_ceiling`."""
         return values.memoryless_ceiling(self, deterministic)
 
     @property
     def return_bounds(self) -> tuple[float, float]:
-        """The lowest and the highest return of an episode without the noise of rewards; see `values.return_bounds`."""
+        """The lowest and the highest return of an episode without the noise of rewards; infinite if unbounded."""
         return values.return_bounds(self)
 
     @property
     def return_noise(self) -> float:
-        """The largest standard deviation that this noise gives to an episode's return; see `values.return_noise`."""
+        """The largest standard deviation that this noise gives to an episode's return."""
         return values.return_noise(self)
 
     @property
@@ -340,11 +340,7 @@ def are_graphs(tasks: Iterable[TaskLike]) -> TypeGuard[Sequence[Task]]:
 
 
 def ct_graphs(tasks: Sequence[TaskLike], what: str) -> Sequence[Task]:
-    """Return tasks that are all CT-graphs.
-
-    Args:
-        tasks: of any kind.
-        what: needs CT-graphs, in words.
+    """Return tasks that are all CT-graphs; ``what`` says in words what needs them.
 
     Raises:
         ValueError: for another kind.

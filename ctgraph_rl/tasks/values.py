@@ -39,10 +39,10 @@ SUM_TOLERANCE = 1e-6
 
 
 def optimal_value(task: Task, gamma: float) -> float:
-    """The best expected discounted return from the home state, of any policy; it may include deliberate failing.
+    """The best expected discounted return from the home state, of any policy; deliberate failing included.
 
-    For the plain needle (goal 1, fail 0) it is gamma^-1 (gamma^2 (1 - p) / (1 - gamma p))^(d + 1). Needles take O(d),
-    other rewards visit every state.
+    For goal 1 and fail 0 of a needle: gamma^-1 (gamma^2 (1 - p) / (1 - gamma p))^(d + 1). Needles take O(d), other
+    rewards visit every state.
 
     Args:
         task: any task.
@@ -124,9 +124,8 @@ def policy_measures(task: Task, policy: Tensor, gamma: float = 1.0) -> Measures:
 def memoryless_ceiling(task: Task, deterministic: bool = False) -> float:
     """The best mean return of a policy that sees an observation id and remembers nothing.
 
-    Exact for needles with goal_reward > 0, fail_reward <= 0 and step_reward = 0. No way on is then worse than failing,
-    so waiting at wait states and deciding at decision states loses nothing, whether wait ids are unique or not. What is
-    left is the choice of decisions; with c_a the number of times that the way to the goal takes decision a:
+    Exact for needles with goal_reward > 0, fail_reward <= 0 and step_reward = 0. Waiting at wait states and deciding at
+    decision states then loses nothing. With c_a the number of times that the way to the goal takes decision a:
 
     - unique decisions: every decision can be the right one; goal_reward.
     - stochastic: decisions are drawn with the same probabilities q at every decision state, drawn ids or not, and
@@ -156,11 +155,9 @@ def memoryless_ceiling(task: Task, deterministic: bool = False) -> float:
 
 
 def return_bounds(task: Task) -> tuple[float, float]:
-    """Return the lowest and the highest return of an episode, undiscounted; infinite where nothing bounds it.
+    """Return the lowest and the highest return of an episode, undiscounted and without noise; infinite if unbounded.
 
-    An end state pays ``goal_reward`` times a share within the reward's ``bounds``, and the fail state ``fail_reward``.
-    The noise of rewards is left out, see `return_noise`. The sum of a ``step_reward`` is not bounded, as an agent may
-    wait on.
+    The sum of a ``step_reward`` is not bounded, as an agent may wait on.
     """
     bounds = getattr(task.reward_fn, "bounds", None)
     if bounds is None:
@@ -171,10 +168,7 @@ def return_bounds(task: Task) -> tuple[float, float]:
 
 
 def return_noise(task: Task) -> float:
-    """Return the largest standard deviation that the noise of rewards gives to the return of an episode.
-
-    One end state pays in an episode: ``reward_std``, times the size of what is paid where noise is multiplicative.
-    """
+    """Return the largest standard deviation that the noise of rewards gives to the return of an episode."""
     if task.reward_std == 0 or task.reward_noise == "additive":
         return task.reward_std
     bounds = getattr(task.reward_fn, "bounds", None)
@@ -185,12 +179,10 @@ def return_noise(task: Task) -> float:
 def open_loop_ceiling(task: Task) -> float:
     """The best mean return of a sequence of actions that is fixed before the episode and ignores all observations.
 
-    Without waiting in place (p = 0) episodes of a sequence are all alike, so the best one is optimal (section 3.3 of
-    the paper). Else, for needles with goal_reward > 0, fail_reward <= 0 and step_reward = 0: an episode that is still
-    in a wait state when the sequence decides has failed, and so has one in a decision state when it waits. Each of the
-    d wait states before a decision must be left at a step fixed before, best the first one, with probability 1 - p. The
-    last wait state, before the end state, may take as long as it likes. So the goal is reached with probability
-    (1 - p)^d, and all other episodes fail.
+    With p = 0 episodes of a sequence are all alike, so the best one is optimal (section 3.3 of the paper). Else, for
+    needles with goal_reward > 0, fail_reward <= 0 and step_reward = 0: each of the d wait states before a decision must
+    be left at a step fixed before, best the first one, with probability 1 - p. The last wait state may take any time.
+    So the goal is reached with probability (1 - p)^d, and all other episodes fail.
 
     Args:
         task: a task as above.
@@ -338,7 +330,7 @@ class _GoalPath:
 
 
 class _GoalAndAnother(_GoalPath):
-    """`_GoalPath` with two of the b decisions, which are all that a best choice depends on."""
+    """With two of the b decisions, which are all that a best choice depends on."""
 
     def children(self, values: Tensor, level: int) -> Tensor:
         """Values of level + 1 by parent, of the decision for the goal and of any other one: float64 [2, 2]."""

@@ -23,8 +23,8 @@ class Distances(NamedTuple):
 def distances(images: Tensor, groups: Sequence[int]) -> Distances:
     """Measure how far apart images are within and between groups.
 
-    The sum of |x - y| over the pairs of two groups is, per pixel, the sum over levels of A (m - B) + B (n - A), where A
-    and B count each group's images up to the level and n and m count all: integers, and linear in the images.
+    Per pixel, the sum of |x - y| over the pairs of two groups is the sum over levels of A (m - B) + B (n - A), where A
+    and B count each group's images up to the level and n and m count all.
 
     Args:
         images: uint8 [n, r, r].

@@ -145,7 +145,7 @@ class GymTask:
 
     @classmethod
     def make_env(cls, tasks: Sequence[GymTask], seed: int = 0, **settings: Any) -> Any:
-        """Return a `ctgraph_rl.batch.gym_env.GymEnv` with one row for each of ``tasks``; see `TaskLike`."""
+        """Return a `ctgraph_rl.batch.gym_env.GymEnv` with one row for each of ``tasks``."""
         return environment(GymTask)(tasks, seed, **settings)
 
     def make(self) -> gymnasium.Env[Any, Any]:
