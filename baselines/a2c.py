@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from baselines.parts.merge import mean
 from baselines.parts.networks import Data, TensorsByName
 from baselines.parts.policy_gradient import PolicyGradient, PolicyGradientSettings, critic_loss, entropy_loss
 from ctgraph_rl.checks import not_negative, require
@@ -32,9 +33,9 @@ class A2C(PolicyGradient):
 
     def loss(self, batch: Data) -> TensorsByName:
         """Compute the losses of policy, critic and entropy, as TorchRL's `A2CLoss` does."""
-        log_probs, taken, values = self.evaluate_actions(batch)
+        frames, log_probs, taken, values = self.evaluate_actions(batch)
         return {
-            "loss_objective": -(taken * batch["advantage"]).mean(),
-            "loss_critic": critic_loss(values, batch, self.settings.critic_coeff),
-            **entropy_loss(log_probs, self.settings.entropy_coeff),
+            "loss_objective": -mean(taken * frames["advantage"], frames),
+            "loss_critic": critic_loss(values, frames, self.settings.critic_coeff),
+            **entropy_loss(log_probs, frames, self.settings.entropy_coeff),
         }

@@ -40,12 +40,12 @@ from torch.nn.functional import mse_loss, pad
 from torchrl.data import Composite, TensorSpec
 
 from baselines.cells.cell import linear_layer
-from baselines.parts.distinct import distinct
 from baselines.parts.networks import Data, TensorsByName, guided, highest, is_greedy, num_actions_of, require_weights
 from baselines.update.measured import require_finite
 from baselines.update.update import minimise
 from ctgraph_rl.checks import NamedValues, at_least_one, fraction, make_fields_plain, positive, require, require_memory
 from ctgraph_rl.learn.collect import UNSTORED
+from ctgraph_rl.learn.histories import distinct
 
 PASSES = 5
 NOISE = 0.001

@@ -12,6 +12,7 @@ import torch
 from torchrl.data import Composite, TensorSpec
 
 from baselines.parts.learner import MOST_PASSES
+from baselines.parts.merge import mean
 from baselines.parts.networks import Data, TensorsByName
 from baselines.parts.policy_gradient import PolicyGradient, PolicyGradientSettings, critic_loss, entropy_loss
 from ctgraph_rl.checks import at_least_one, at_most, not_negative, positive, require
@@ -56,12 +57,12 @@ class PPO(PolicyGradient):
 
     def loss(self, batch: Data) -> TensorsByName:
         """Compute the clipped surrogate, eq. (7), critic's and entropy losses, as TorchRL's `ClipPPOLoss` does."""
-        log_probs, taken, values = self.evaluate_actions(batch)
-        change = taken - batch["action_log_prob"].unsqueeze(-1)
-        gain = change.exp() * batch["advantage"]
-        clipped = change.clamp(*self.clip_range).exp() * batch["advantage"]
+        frames, log_probs, taken, values = self.evaluate_actions(batch)
+        change = taken - frames["action_log_prob"].unsqueeze(-1)
+        gain = change.exp() * frames["advantage"]
+        clipped = change.clamp(*self.clip_range).exp() * frames["advantage"]
         return {
-            "loss_objective": -torch.minimum(gain, clipped).mean(),
-            "loss_critic": critic_loss(values, batch, self.settings.critic_coeff),
-            **entropy_loss(log_probs, self.settings.entropy_coeff),
+            "loss_objective": -mean(torch.minimum(gain, clipped), frames),
+            "loss_critic": critic_loss(values, frames, self.settings.critic_coeff),
+            **entropy_loss(log_probs, frames, self.settings.entropy_coeff),
         }

@@ -6,6 +6,7 @@ a batch cuts off is bootstrapped with the baseline's value. There is no bonus fo
 
 from __future__ import annotations
 
+from baselines.parts.merge import mean
 from baselines.parts.networks import Data, TensorsByName
 from baselines.parts.policy_gradient import PolicyGradient, critic_loss
 
@@ -17,8 +18,8 @@ class Reinforce(PolicyGradient):
 
     def loss(self, batch: Data) -> TensorsByName:
         """Compute the losses of policy and baseline, as TorchRL's `ReinforceLoss` does."""
-        _, taken, values = self.evaluate_actions(batch)
+        frames, _, taken, values = self.evaluate_actions(batch)
         return {
-            "loss_actor": -(taken * batch["advantage"]).mean(),
-            "loss_value": critic_loss(values, batch, 1.0),
+            "loss_actor": -mean(taken * frames["advantage"], frames),
+            "loss_value": critic_loss(values, frames, 1.0),
         }

@@ -18,7 +18,7 @@ from torch.nn.functional import one_hot
 from torchrl.data import Composite, TensorSpec
 from typing_extensions import override
 
-from baselines.parts.networks import GROUP, Data, Items, RecurrentModule, TensorsByName, num_actions_of
+from baselines.parts.networks import HISTORY, INPUT, Data, Items, RecurrentModule, TensorsByName, num_actions_of
 from baselines.parts.policy_gradient import Seeds
 from baselines.ppo import PPO, PPOSettings
 from ctgraph_rl.checks import at_least_one, require
@@ -42,6 +42,7 @@ class TrialTrunk(TensorDictModuleBase):
         self.trunk = trunk
         self.num_actions = num_actions
         self.trial_episodes = trial_episodes
+        self.state_keys = trunk.state_keys
         self.in_keys = [*(key for key in trunk.in_keys if key != "previous"), *OWN_KEYS]
         self.out_keys = [*trunk.out_keys, ("next", "trial")]
 
@@ -58,19 +59,19 @@ class TrialTrunk(TensorDictModuleBase):
         """Compute ``memory`` at all steps of sequences [rows, steps]."""
         return self.trunk.over_time(self._inputs(data)[0])
 
-    def groups(self, data: Data) -> Tensor:
-        """Number the different inputs of frames, int64 [rows, steps]; see `RecurrentModule`."""
-        return self.trunk.groups(self._inputs(data)[0])
+    def number_histories(self, data: Data) -> Items:
+        """Number the inputs and the histories of frames, int64 [rows, steps] each; see `RecurrentModule`."""
+        return self.trunk.number_histories(self._inputs(data)[0])
 
-    def of_distinct(self, data: Data) -> tuple[Tensor, Tensor]:
+    def of_histories(self, data: Data) -> tuple[Tensor, Tensor]:
         """Compute ``memory`` of different histories, and which of them each frame has; see `RecurrentModule`."""
-        return self.trunk.of_distinct(self._inputs(data)[0])
+        return self.trunk.of_histories(self._inputs(data)[0])
 
     def _inputs(self, data: Data) -> tuple[TensorsByName, Tensor]:
         """Return the inputs of the inner trunk, and the number of the episode in its trial, from 1."""
         episode = data["trial"] + data["is_init"]
         fresh = data["is_init"] & ((episode == 1) | (episode > self.trial_episodes))
-        inputs = {key: data[key] for key in (*self.trunk.in_keys, GROUP) if key != "previous" and key in data}
+        inputs = {key: data[key] for key in (*self.trunk.in_keys, INPUT, HISTORY) if key != "previous" and key in data}
         action = one_hot(data["previous_action"], self.num_actions)
         previous = torch.cat([action, data["reward"]], dim=-1)
         return inputs | {"is_init": fresh, "previous": torch.where(fresh, 0.0, previous)}, episode

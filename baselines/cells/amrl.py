@@ -81,16 +81,15 @@ class AMRL(Cell):
         if self.is_max:
             first = torch.maximum(state[0].unsqueeze(1), x[:, :1])
             m = max_scan(torch.cat([first, x[:, 1:].relu()], dim=1), starts)
-            after: CellState = (m[:, -1],)
         else:
             sums = _sums(x, starts, state[0])
             counts = _sums(torch.ones_like(x[..., :1]), starts, state[1])
             m = sums / counts
-            after = (sums[:, -1], counts[:, -1])
         if self.straight_through:
             straight = _sums(x, starts, state[0]) if self.is_max else sums
             m = m.detach() + (straight - straight.detach())
-        return m, after
+        after = (m,) if self.is_max else (sums, counts)
+        return m, tuple(value[:, -1] for value in after)
 
     def _output(self, m: Tensor, y: Tensor) -> Tensor:
         return self.linear(torch.cat([y, m], dim=-1)).relu()

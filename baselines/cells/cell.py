@@ -10,18 +10,14 @@ from torch import Tensor, nn
 
 from ctgraph_rl.checks import TakesNumbers, require, true_or_false
 from ctgraph_rl.core.dynamics import beside
-from ctgraph_rl.core.kernel import is_traced
 from ctgraph_rl.learn.collect import PREVIOUS_ACTION
+from ctgraph_rl.learn.histories import Tree
 
 CellState = tuple[Tensor, ...]
 """The parts of a cell's state, [rows, ...] each, in the order of its ``state_keys``."""
 
 CellOutput = tuple[Tensor, CellState]
 """What a cell writes in a step, and its next state."""
-
-Branches = Sequence[tuple[Tensor, Tensor]]
-"""Of the histories of each length: which of the one shorter each continues, or which state, and the group of its last
-input; int64 [num_histories] each."""
 
 REWARD = "reward"
 """The key of an agent's last reward."""
@@ -93,32 +89,29 @@ class Cell(TakesNumbers, nn.Module):
             outputs.append(output)
         return torch.stack(outputs, dim=1)
 
-    def tree(self, inputs: Tensor, branches: Branches, state: CellState) -> Tensor:
-        """Compute the outputs at the ends of different histories; see `baselines.parts.distinct.histories`.
+    def over_tree(self, tree: Tree, inputs: Tensor, groups: Tensor, state: CellState) -> Tensor:
+        """Compute the outputs at the ends of different histories, [num_histories, num_outputs].
 
         Args:
+            tree: the histories.
             inputs: [num_groups, num_inputs].
-            branches: the histories of each length.
-            state: the different states before a first step.
-
-        Returns:
-            [num_histories, num_outputs], the shortest first.
+            groups: the group of each history's last inputs, int64 [num_histories].
+            state: what the histories of length 1 go on from; see `Tree.initial`.
         """
         outputs = []
-        for shorter, groups in branches:
-            before = tuple(value.index_select(0, shorter) for value in state)
-            output, state = self.step(inputs.index_select(0, groups), before)
+        first = 0
+        num_before = tree.sizes[0]
+        for shorter, group in zip(tree.shorter.split(tree.sizes), groups.split(tree.sizes), strict=True):
+            before = tuple(value.index_select(0, shorter - first) for value in state)
+            first += num_before
+            num_before = len(group)
+            output, state = self.step(inputs.index_select(0, group), before)
             outputs.append(output)
         return torch.cat(outputs)
 
 
 MakeCell = Callable[..., Cell]
 """Return a cell for ``num_features``, ``num_outputs`` and ``num_actions``."""
-
-
-def can_branch(value: Tensor) -> bool:
-    """Return whether code may branch on values: a GPU would have to wait for them, and a stack of seeds has many."""
-    return value.is_cpu and not is_traced()
 
 
 def of_frames(values: Tensor, groups: Tensor) -> Tensor:

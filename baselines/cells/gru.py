@@ -11,8 +11,10 @@ import torch
 from torch import Tensor, nn
 
 from baselines.cells.cell import Cell, CellOutput, CellState
+from baselines.cells.over_tree import GatedTree, GatesOverTree, GRUGates
 from baselines.cells.packed import segments
 from ctgraph_rl.core.kernel import is_traced
+from ctgraph_rl.learn.histories import Tree
 
 
 class GRU(Cell):
@@ -38,6 +40,12 @@ class GRU(Cell):
         """See `Cell`; each segment between two resets is a sequence, and the GRU runs over all of them at once."""
         step = partial(gru_step, self.gru)
         return segments(starts).run(step, gru_inputs(self.gru, inputs), groups, state)
+
+    def over_tree(self, tree: Tree, inputs: Tensor, groups: Tensor, state: CellState) -> Tensor:
+        """See `Cell`; with a backward pass of its own."""
+        _, of_h, _, bias = self.gru.all_weights[0]
+        given = gru_inputs(self.gru, inputs)
+        return GatesOverTree.apply(GatedTree(GRUGates, tree, groups), given, of_h, bias, *state)
 
 
 def gru_inputs(gru: nn.GRU, features: Tensor) -> Tensor:

@@ -10,8 +10,10 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from baselines.cells.cell import Branches, Cell, CellOutput, CellState, can_branch, of_frames, zeros_like_weights
+from baselines.cells.cell import Cell, CellOutput, CellState, of_frames, zeros_like_weights
+from baselines.cells.over_tree import GatedTree, GatesOverTree, LSTMGates
 from baselines.cells.packed import segments
+from ctgraph_rl.learn.histories import Tree
 
 
 class LSTM(Cell):
@@ -30,9 +32,6 @@ class LSTM(Cell):
 
     def step(self, inputs: Tensor, state: CellState) -> CellOutput:
         """See `Cell`."""
-        if can_branch(inputs):
-            output, (h, c) = self.lstm(inputs.unsqueeze(1), _layer_first(state))
-            return output.squeeze(1), (h.transpose(0, 1), c.transpose(0, 1))
         given = lstm_inputs(self.lstm, inputs)
         h, c = lstm_step(self.lstm, given, state[0].squeeze(1), state[1].squeeze(1))
         return h, (h.unsqueeze(1), c.unsqueeze(1))
@@ -46,18 +45,12 @@ class LSTM(Cell):
         before = [value.squeeze(1) for value in state]
         return segments(starts).run(step, lstm_inputs(self.lstm, inputs), groups, before)
 
-    def tree(self, inputs: Tensor, branches: Branches, state: CellState) -> Tensor:
-        """See `Cell`; with one product of features and weights for each group."""
+    def over_tree(self, tree: Tree, inputs: Tensor, groups: Tensor, state: CellState) -> Tensor:
+        """See `Cell`; with a backward pass of its own."""
         given = lstm_inputs(self.lstm, inputs)
-        h = state[0].squeeze(1)
-        c = state[1].squeeze(1)
-        memory = []
-        for shorter, groups in branches:
-            h = h.index_select(0, shorter)
-            c = c.index_select(0, shorter)
-            h, c = lstm_step(self.lstm, given.index_select(0, groups), h, c)
-            memory.append(h)
-        return torch.cat(memory)
+        parts = [value.squeeze(1) for value in state]
+        gated = GatedTree(LSTMGates, tree, groups)
+        return GatesOverTree.apply(gated, given, self.lstm.all_weights[0][1], None, *parts)
 
 
 def _layer_first(state: CellState) -> CellState:

@@ -9,10 +9,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from baselines.parts.distinct import distinct
 from ctgraph_rl.checks import require
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.collect import InitialState, Policy, collect
+from ctgraph_rl.learn.histories import distinct
 from ctgraph_rl.policies import NavigationPolicy
 from ctgraph_rl.tasks.observability import transition_entropy
 from ctgraph_rl.tasks.task import Task, ct_graphs

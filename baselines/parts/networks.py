@@ -15,11 +15,12 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import ProbabilisticActor, ValueOperator, recurrent_mode
 
-from baselines.cells.cell import REWARD, Cell, CellState, MakeCell, can_branch, linear_layer, reset
-from baselines.parts.distinct import distinct, histories, renumbered
+from baselines.cells.cell import REWARD, Cell, CellState, MakeCell, linear_layer, reset
 from ctgraph_rl.checks import one_of, require, require_memory
+from ctgraph_rl.learn import histories
 from ctgraph_rl.learn.collect import PREVIOUS_ACTION, UNSTORED
 from ctgraph_rl.learn.guide import GUIDED_ACTION
+from ctgraph_rl.learn.histories import can_branch, distinct, renumber
 
 Data = Mapping[Any, Tensor]
 """Tensors by key, in a dictionary or a TensorDict."""
@@ -30,8 +31,17 @@ Items = dict[Any, Tensor]
 TensorsByName = dict[str, Tensor]
 """Such as losses, outputs and weights."""
 
-GROUP = "group"
-"""The key of numbers of frames, int64, the same for frames with the same inputs; see `EncoderModule.groups`."""
+INPUT = "input_number"
+"""The key of numbers of frames, int64, the same for frames with the same inputs."""
+
+FEWEST_ROWS = 128
+"""Rows from which on it pays to look for those with the same history when acting."""
+
+MOST_ROWS = 0.25
+"""Share of rows with different histories up to which it pays to act once for each history."""
+
+HISTORY = "history_number"
+"""The key of numbers of frames, int64, the same for frames with the same history; without memory, the same inputs."""
 
 
 ENCODERS = ("mlp", "cnn")
@@ -124,15 +134,15 @@ class EncoderModule(TensorDictModule):
         """Compute the features of any number of steps."""
         return self.module(*(data[key] for key in self.in_keys))
 
-    def groups(self, data: Data) -> Tensor:
-        """Number the different inputs of frames, [rows, steps] of them; int64 [rows, steps]."""
+    def number_histories(self, data: Data) -> Items:
+        """Number the inputs of frames, [rows, steps] of them, from 0; int64 [rows, steps]."""
         inputs = [data[key] for key in self.in_keys]
         _, groups = distinct([value.flatten(0, 1) for value in inputs])
-        return groups.view(inputs[0].shape[:2])
+        return {HISTORY: groups.view(inputs[0].shape[:2])}
 
-    def of_distinct(self, data: Data) -> tuple[Tensor, Tensor]:
+    def of_histories(self, data: Data) -> tuple[Tensor, Tensor]:
         """Compute features of different frames, [n, num_features], and which of them each has, int64 [num_frames]."""
-        examples, groups = renumbered(data[GROUP])
+        examples, groups = renumber(data[HISTORY])
         features = self.module(*(data[key].index_select(0, examples) for key in self.in_keys))
         return features, groups
 
@@ -171,10 +181,20 @@ class RecurrentModule(TensorDictModuleBase):
         return tensordict.update(written)
 
     def act(self, data: Data) -> Items:
-        """Compute ``memory`` and the next state for one step of all rows."""
-        inputs = joined(self.encoder.over_time(data), *self._own(data))
+        """Compute ``memory`` and the next state for one step of all rows, once for rows with the same history."""
+        seen = [data[key] for key in self.encoder.in_keys]
+        own = self._own(data)
         state = reset([data[key] for key in self.state_keys], data["is_init"].squeeze(-1))
-        memory, state = self.cell.step(inputs, state)
+        groups = None
+        if len(seen[0]) >= FEWEST_ROWS:
+            examples, groups = distinct([*seen, *own, *state], most=MOST_ROWS)
+            if len(examples) < len(groups):
+                seen, own, state = (_rows(values, examples) for values in (seen, own, state))
+            else:
+                groups = None
+        memory, state = self.cell.step(joined(self.encoder.module(*seen), *own), tuple(state))
+        if groups is not None:
+            memory, *state = _rows([memory, *state], groups)
         written: Items = {"memory": memory}
         for key, value in zip(self.state_keys, state, strict=True):
             written["next", key] = value
@@ -190,17 +210,21 @@ class RecurrentModule(TensorDictModuleBase):
         faster = cell.sequence if can_branch(starts) else partial(Cell.sequence, cell)
         return faster(inputs, groups, starts, state)
 
-    def of_distinct(self, data: Data) -> tuple[Tensor, Tensor]:
-        """Compute ``memory`` of different histories, [n, num_outputs], and which each frame has, [rows, steps]."""
+    def of_histories(self, data: Data) -> tuple[Tensor, Tensor]:
+        """Compute ``memory`` of different histories, [n, num_outputs], and which each frame has, [rows * steps]."""
         inputs, groups, starts, state = self._sequences(data)
-        found = histories(groups, starts, state)
-        return self.cell.tree(inputs, found.branches, found.initial), found.of_frames
+        found = histories.tree(data[HISTORY], starts)
+        of_last = groups.flatten().index_select(0, found.frames)
+        return self.cell.over_tree(found, inputs, of_last, found.initial(starts, state)), found.of_frames
 
-    def groups(self, data: Data) -> Tensor:
-        """Number the different inputs of frames, [rows, steps] of them; int64 [rows, steps]."""
+    def number_histories(self, data: Data) -> Items:
+        """Number the inputs and the histories of frames, [rows, steps] of them, from 0; int64 [rows, steps] each."""
         seen, own = self._read(data)
+        starts = data["is_init"].squeeze(-1)
         _, groups = distinct([*seen, *own])
-        return groups.view(data["is_init"].shape[:2])
+        inputs = groups.view_as(starts)
+        state = [data[key][:, 0] for key in self.state_keys]
+        return {INPUT: inputs, HISTORY: histories.number_histories(inputs, starts, state)}
 
     def _read(self, data: Data) -> tuple[list[Tensor], list[Tensor]]:
         """Return what the encoder reads at all frames, [rows * steps, ...] each, and what the cell reads beside it."""
@@ -211,7 +235,7 @@ class RecurrentModule(TensorDictModuleBase):
         """Return what the cell reads, one for all frames with the same inputs; see `Cell.sequence`."""
         starts = data["is_init"].squeeze(-1)
         seen, own = self._read(data)
-        examples, groups = renumbered(data[GROUP].flatten()) if GROUP in data else distinct([*seen, *own])
+        examples, groups = renumber(data[INPUT].flatten()) if INPUT in data else distinct([*seen, *own])
         features = self.encoder.module(*(value.index_select(0, examples) for value in seen))
         inputs = joined(features, *(value.index_select(0, examples) for value in own))
         state = reset([data[key][:, 0] for key in self.state_keys], starts[:, 0])
@@ -236,6 +260,10 @@ class RecurrentModule(TensorDictModuleBase):
         return found
 
 
+def _rows(values: Sequence[Tensor], rows: Tensor) -> list[Tensor]:
+    return [value.index_select(0, rows) for value in values]
+
+
 def trunk_of(policy: object) -> Any:
     """Return the part of a policy before its output layers, which has ``over_time`` and ``in_keys``; None without."""
     parts = policy.modules() if isinstance(policy, nn.Module) else ()
@@ -253,9 +281,9 @@ def copied_action(keys: Sequence[str]) -> list[TensorDictModule]:
     return [copy] * (PREVIOUS_ACTION in keys)
 
 
-def sequences_of(batch: Data, keys: Sequence[str]) -> TensorsByName:
-    """Return inputs of a batch, [rows, steps, ...] each; of states that are not stored for each step the first one."""
-    return {key: batch[key][:, :1] if key.startswith(UNSTORED) else batch[key] for key in keys}
+def sequences_of(batch: Data, keys: Sequence[str], states: Sequence[str] = ()) -> TensorsByName:
+    """Return inputs of a batch, [rows, steps, ...] each; of ``states`` and of what is not stored, the first step's."""
+    return {key: batch[key][:, :1] if key.startswith(UNSTORED) or key in states else batch[key] for key in keys}
 
 
 def require_weights(
@@ -375,11 +403,7 @@ class ActorCritic(TensorDictSequential):
 
     def outputs(self, data: Data) -> TensorsByName:
         """Compute ``log_probs`` of all actions and ``state_value`` at any number of steps, [..., n] each."""
-        trunk = self._parts[0]
-        if GROUP not in data:
-            return self.heads(trunk.over_time(data))
-        features, which = trunk.of_distinct(data)
-        return {key: value[which] for key, value in self.heads(features).items()}
+        return self.heads(self._parts[0].over_time(data))
 
     def one_step(self, data: Data) -> Items:
         """Compute `outputs` for one step of all rows, and with memory the next state under ``("next", key)``."""

@@ -19,7 +19,8 @@ from baselines.cells.cell import MakeCell
 from baselines.cells.lstm import LSTM
 from baselines.parts import networks
 from baselines.parts.learner import Learner
-from baselines.parts.networks import GROUP, ActorCritic, Data, Items, TensorsByName
+from baselines.parts.merge import KIND, mean, merge, number_frames
+from baselines.parts.networks import ActorCritic, Data, Items, TensorsByName
 from baselines.update.update import OPTIMISERS, make_optimiser
 from ctgraph_rl.checks import (
     at_least_one,
@@ -54,7 +55,6 @@ class PolicyGradientSettings:
     compile: bool = False  # run gradient steps through torch.compile; only without memory
     orthogonal_init: bool = False  # weights as in the code of Ben-Iwhiwhu et al. 2023, see `make_orthogonal`
     cell: MakeCell | None = None  # what remembers, of `baselines.cells`; None: an LSTM; only with memory
-    deduplicate: bool = False  # on a CPU, compute frames of a minibatch with the same inputs or history once
     encoder: str = "mlp"  # mlp, or cnn with two convolutions before the first layer, for images
 
     def __post_init__(self) -> None:
@@ -66,10 +66,7 @@ class PolicyGradientSettings:
             *positive(learning_rate=self.learning_rate, gamma=self.gamma, gae_lambda=self.gae_lambda),
             *fraction(gamma=self.gamma, gae_lambda=self.gae_lambda),
             *true_or_false(normalize_advantage=self.normalize_advantage, orthogonal_init=self.orthogonal_init),
-            *true_or_false(deduplicate=self.deduplicate),
         )
-        only = "deduplicate must be false with compile=true, which needs fixed sizes"
-        require((not (self.compile and self.deduplicate), only))
         decay = self.gamma * self.gae_lambda
         rule = f"gamma * gae_lambda must be >= {SMALLEST_DECAY:g}, got {self.gamma!r} * {self.gae_lambda!r} = {decay:g}"
         require((decay >= SMALLEST_DECAY, f"{rule}; use a larger gae_lambda"))
@@ -145,11 +142,22 @@ class PolicyGradient(Learner):
         if self.settings.orthogonal_init:
             networks.make_orthogonal(self.trunk, self.actor, self.critic)
 
-    def evaluate_actions(self, batch: Data) -> tuple[Tensor, Tensor, Tensor]:
-        """Compute log-probabilities of all actions, those of the actions taken, and values, with present weights."""
-        outputs = self.policy.outputs(batch)
+    def evaluate_actions(self, batch: Data) -> tuple[Data, Tensor, Tensor, Tensor]:
+        """Compute log-probabilities of all actions, those of the actions taken, and values, with present weights.
+
+        They are those of the frames that come first: of the batch, or of one that stands for all of its kind; see
+        `merge`.
+        """
+        frames = batch
+        if KIND not in batch:
+            outputs = self.policy.outputs(batch)
+        else:
+            chosen, frames = merge(batch)
+            features, histories = self.trunk.of_histories(batch)
+            of_chosen = histories.index_select(0, chosen)
+            outputs = {key: value.index_select(0, of_chosen) for key, value in self.policy.heads(features).items()}
         log_probs = outputs["log_probs"]
-        return log_probs, log_probs.gather(-1, batch["action"].unsqueeze(-1)), outputs["state_value"]
+        return frames, log_probs, log_probs.gather(-1, frames["action"].unsqueeze(-1)), outputs["state_value"]
 
     @override
     def outputs(self, data: Data) -> TensorsByName:
@@ -220,10 +228,12 @@ class PolicyGradient(Learner):
             mean = of_seeds.mean(dim=(1, 2, 3), keepdim=True)
             deviation = of_seeds.std(dim=(1, 2, 3), correction=0, keepdim=True)
             advantage = ((of_seeds - mean) / (deviation + 1e-8)).flatten(0, 1)
-        inputs = networks.sequences_of(batch, [*self.trunk.in_keys, "action", "action_log_prob"])
-        if self.settings.deduplicate and advantage.is_cpu:
-            inputs[GROUP] = self.trunk.groups(batch)
-        return inputs | {"advantage": advantage, "value_target": target}
+        states = self.trunk.state_keys if self.memory else ()
+        items = networks.sequences_of(batch, [*self.trunk.in_keys, "action", "action_log_prob"], states)
+        items |= {"advantage": advantage, "value_target": target}
+        if seeds.number == 1 and self.compiled_step is None:
+            items |= number_frames(self.trunk, items, self.num_minibatches)
+        return items
 
     def advantages(
         self, batch: TensorDictBase, next_values: Tensor, done: Tensor, terminated: Tensor
@@ -240,12 +250,14 @@ def generalized_advantages(gamma: float, gae_lambda: float, *given: Tensor) -> t
         return estimate(gamma, gae_lambda, *given)
 
 
-def critic_loss(values: Tensor, batch: Data, weight: float) -> Tensor:
+def critic_loss(values: Tensor, frames: Data, weight: float) -> Tensor:
     """Compute the critic's weighted mean squared error."""
-    return (weight * (values - batch["value_target"]).square()).mean()
+    loss = mean(weight * (values - frames["value_target"]).square(), frames)
+    spread = frames.get("spread")
+    return loss if spread is None else loss + weight * spread
 
 
-def entropy_loss(log_probs: Tensor, weight: float) -> TensorsByName:
+def entropy_loss(log_probs: Tensor, frames: Data, weight: float) -> TensorsByName:
     """Return the negative weighted entropy of the policy as a loss, and the entropy."""
     entropies = networks.entropy(log_probs)
-    return {"loss_entropy": (-weight * entropies).mean(), "entropy": entropies.detach().mean()}
+    return {"loss_entropy": mean(-weight * entropies, frames), "entropy": mean(entropies.detach(), frames)}

@@ -39,8 +39,6 @@ def why_not_together(agent: Agent) -> str | None:
     """Return why agents like this one cannot act and learn as one batch; None if they can."""
     learner = learner_of(agent)
     name = type(learner).__name__
-    if getattr(getattr(learner, "settings", None), "deduplicate", False):
-        return f"{name} with deduplicate=true cannot be vectorised over seeds"
     if not isinstance(learner, Learner) or not learner.stackable or learner.memory:
         return f"{name} cannot be vectorised over seeds"
     if not has_stackable(learner, ("learn", "gradient_step")):

@@ -21,13 +21,13 @@ from ctgraph_rl.packages import check_packages
 from ctgraph_rl.portable import cpu_model, is_portable
 from ctgraph_rl.tasks.curriculum import Curriculum
 
-NUMBERS = 1
+NUMBERS = 2
 """The numbers version of this package: raised when equal configurations and seeds give other weights or measurements.
 
 Every run stores it. A log without it is of numbers version 1.
 """
 
-NUMBERS_TOGETHER = 2
+NUMBERS_TOGETHER = 3
 """The numbers version of runs whose seeds were trained as one batch, which rose by what changed for these only."""
 
 

@@ -31,7 +31,6 @@ LSTM = {
 """What stands behind the encoder of an agent with memory, unless ``cell=`` says otherwise."""
 
 _ENCODER: NamedValues = {"encoder": "mlp"}
-_DEDUPLICATE: NamedValues = {"deduplicate": False, **_ENCODER}
 _CELL: NamedValues = {"cell": LSTM, **_ENCODER}
 _BACKBONE: NamedValues = {"backbone_seed": None}
 
@@ -44,17 +43,17 @@ ADDED: dict[str, NamedValues] = {
     },
     "baselines.dqn.DQN": _ENCODER,
     "baselines.mohqa.MOHQA": _ENCODER,
-    "baselines.a2c.A2C": _DEDUPLICATE,
-    "baselines.reinforce.Reinforce": _DEDUPLICATE,
-    "baselines.ppo.PPO": _DEDUPLICATE,
-    "baselines.ppo_count.PPOCount": _DEDUPLICATE,
-    "baselines.ppo_rnd.PPORND": _DEDUPLICATE,
+    "baselines.a2c.A2C": _ENCODER,
+    "baselines.reinforce.Reinforce": _ENCODER,
+    "baselines.ppo.PPO": _ENCODER,
+    "baselines.ppo_count.PPOCount": _ENCODER,
+    "baselines.ppo_rnd.PPORND": _ENCODER,
     "baselines.drqn.DRQN": _CELL,
     "baselines.qrdqn_lstm.QRDQNLSTM": _CELL,
-    "baselines.lstm_ppo.LSTMPPO": {**_CELL, **_DEDUPLICATE},
+    "baselines.lstm_ppo.LSTMPPO": _CELL,
     "baselines.cavia.CAVIA": {"entropy_coeff": 0.0},
     "baselines.maml.MAML": {"entropy_coeff": 0.0},
-    "baselines.rl2.RL2": {**_CELL, **_DEDUPLICATE},
+    "baselines.rl2.RL2": _CELL,
     "baselines.methods.mask_ri.MaskRI": _BACKBONE,
     "baselines.methods.mask_lc.MaskLC": _BACKBONE,
     "baselines.methods.mask_blc.MaskBLC": _BACKBONE,

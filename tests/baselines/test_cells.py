@@ -15,7 +15,7 @@ from torch import nn
 from baselines.cells.cell import Cell
 from baselines.cells.scan import linear_scan, max_scan
 from baselines.parts.catalogue import catalogue
-from baselines.parts.networks import GROUP, EncoderModule, RecurrentModule
+from baselines.parts.networks import EncoderModule, RecurrentModule
 from ctgraph_rl import CTGraphEnv
 from ctgraph_rl.learn.collect import UNSTORED
 from ctgraph_rl.packages import conf_dir
@@ -89,8 +89,9 @@ def test_a_cell_and_its_gradients_are_the_same_step_by_step_over_sequences_and_o
     by = torch.randn(ROWS, STEPS, OUTPUTS, dtype=torch.float64)
 
     stored = {key: value.unsqueeze(1) for key, value in state.items()}
-    different, which = trunk.of_distinct(data | stored | {GROUP: trunk.groups(data)})
-    ways = (step_by_step(trunk, data, state), trunk.over_time(data | stored), different[which])
+    given = data | stored
+    different, which = trunk.of_histories(given | trunk.number_histories(given))
+    ways = (step_by_step(trunk, data, state), trunk.over_time(data | stored), different[which].view_as(by))
 
     weights = list(trunk.parameters())
     expected, *others = [(way, *(torch.autograd.grad(way, weights, by) if weights else ())) for way in ways]

@@ -19,11 +19,9 @@ from torchrl.objectives import A2CLoss, ClipPPOLoss, DQNLoss, ReinforceLoss, Val
 
 from baselines.cells.lstm import lstm_inputs, lstm_step
 from baselines.cells.packed import Segments
-from baselines.parts.distinct import distinct
-from baselines.parts.networks import GROUP
 from baselines.update import seeds as together
 from baselines.update.compiled import compiler_options
-from baselines.update.seeds import SeedGroup, why_not_together
+from baselines.update.seeds import SeedGroup
 from baselines.update.step import update_state
 from baselines.update.update import update
 from benchmarks import agents as benchmark
@@ -105,55 +103,6 @@ def test_a_packed_lstm_and_its_gradients_equal_pytorchs():
     wanted, by = [features, h, c, *lstm.parameters()], torch.randn_like(memory)
     found, others = (torch.autograd.grad(values, wanted, by) for values in (memory, expected))
     torch.testing.assert_close((memory, *found), (expected, *others), atol=1e-10, rtol=0)
-
-
-def test_frames_are_of_one_kind_where_all_their_inputs_are_the_same():
-    images, numbers = torch.tensor([[[7]], [[9]], [[7]], [[7]]]).byte(), torch.tensor([[0.5], [0.5], [0.5], [0.0]])
-
-    examples, kinds = distinct([images, numbers])
-
-    assert len(examples) == 3
-    assert kinds[0] == kinds[2]
-    assert torch.equal(images[examples][kinds], images) and torch.equal(numbers[examples][kinds], numbers)
-
-
-def test_frames_that_differ_by_less_than_rounding_are_of_different_kinds():
-    values = torch.tensor([[1e30, 0.0], [1e30, 1.0], [1e30, 0.0]])
-
-    examples, kinds = distinct([values])
-
-    assert torch.equal(values[examples][kinds], values)
-
-
-@pytest.mark.parametrize("name", others_slow(["a2c", "ppo", "ppo_count", "reinforce", "lstm_ppo", "rl2"], "a2c", "rl2"))
-def test_losses_and_gradients_are_the_same_where_equal_frames_are_computed_once(small_agent, name):
-    agents = [small_agent(name, [ct_su_b1()], f"agent.deduplicate={once}").double() for once in ("false", "true")]
-    batch = batches(small_agent(name, [ct_su_b1()]), ct_su_b1(), 2)[1]
-    minibatch = {
-        key: value.double() if value.is_floating_point() else value
-        for key, value in learnt_from(small_agent(name, [ct_su_b1()], "agent.deduplicate=true"), batch)[0].items()
-    }
-    grouped = dict(minibatch)
-    del minibatch[GROUP]
-
-    losses = [agent.loss(given) for agent, given in zip(agents, (minibatch, grouped), strict=True)]
-    totals = [sum(value for key, value in found.items() if key.startswith("loss_")) for found in losses]
-    gradients = [
-        torch.autograd.grad(total, list(agent.parameters())) for total, agent in zip(totals, agents, strict=True)
-    ]
-
-    assert len(agents[1].trunk.of_distinct(grouped)[0]) < minibatch["action"].numel()
-    torch.testing.assert_close((losses[1], gradients[1]), (losses[0], gradients[0]), atol=1e-10, rtol=1e-10)
-
-
-def test_steps_whose_sizes_depend_on_data_are_neither_compiled_nor_stacked(small_agent):
-    with pytest.raises(Exception, match="deduplicate must be false with compile=true"):
-        small_agent("ppo", [ct_su_b1()], "agent.deduplicate=true", "agent.compile=true")
-
-    reason = why_not_together(small_agent("ppo", [ct_su_b1()], "agent.deduplicate=true"))
-
-    assert reason == "PPO with deduplicate=true cannot be vectorised over seeds"
-    assert why_not_together(small_agent("ppo", [ct_su_b1()])) is None
 
 
 STOCK_LOSSES = {

@@ -152,7 +152,7 @@ class Samples:
 
     def state(self) -> NamedValues:
         """Return plain values for a state dict."""
-        alike = groupby(self.minibatches, lambda minibatch: minibatch["action"].shape[1:])  # steps of a sequence
+        alike = groupby(self.minibatches, lambda minibatch: (minibatch["action"].shape[1:], [*minibatch]))
         return {"parts": [_joined(list(minibatches)) for _, minibatches in alike]}
 
     def restore(self, state: ReadOnlyValues, device: torch.device) -> None:

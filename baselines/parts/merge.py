@@ -1,0 +1,75 @@
+"""Frames of one history as one: which losses sum up, so that each is computed once.
+
+Used on CPUs where a batch has few histories, as without noise on reading. The choice depends on the batch alone.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor
+
+from baselines.parts.networks import HISTORY, Data, Items
+from ctgraph_rl.learn.histories import can_branch, distinct, renumber
+
+FEWEST_FRAMES = 512
+"""Frames of a minibatch up to which each is computed: with so few, operations take the time, not what they compute."""
+
+LARGEST_SHARE = 0.6
+"""Different histories, as a share of the frames of a batch, from which on each frame is computed."""
+
+KIND = "kind"
+"""The key of numbers of frames, int64, the same for those that `merge` makes one."""
+
+
+def number_frames(trunk: Any, items: Items, num_minibatches: int) -> Items:
+    """Return the numbers of frames by which `merge` and ``trunk.of_histories`` find equal ones.
+
+    Args:
+        trunk: has ``number_histories`` and ``of_histories``.
+        items: its inputs, ``action``, ``action_log_prob`` and ``advantage`` of a batch, [rows, steps, ...] each.
+        num_minibatches: how many parts of the batch are learned from in turn.
+
+    Returns:
+        Keys for the items; none where each frame is to be computed.
+    """
+    action = items["action"]
+    if action.numel() <= FEWEST_FRAMES * num_minibatches or not can_branch(action):
+        return {}
+    numbers = trunk.number_histories(items)
+    history = numbers[HISTORY]
+    if int(history.max()) >= LARGEST_SHARE * history.numel():
+        return {}
+    gains = items["advantage"].view_as(action) > 0
+    taken = (history * (int(action.max()) + 1) + action) * 2 + gains
+    _, kinds = distinct([taken.flatten(), items["action_log_prob"].flatten()])
+    return {**numbers, KIND: kinds.view_as(action)}
+
+
+def merge(batch: Data) -> tuple[Tensor, Items]:
+    """Merge the frames of each kind, which have the same history, action, old log-probability and sign of advantage.
+
+    They have one probability ratio and one value V. So a loss of them is n times the same function of their mean
+    advantage, and the squares of a critic are n (V - m)^2 + S, where m is their mean target and S the squares around
+    it. Means are float64: V is near m when trained, and advantages cancel.
+
+    Returns:
+        A frame of each kind, int64 [num_kinds]; and its action, old log-probability, mean ``advantage`` and
+        ``value_target``, ``count`` n, and ``spread``, the sum of S of all kinds by the number of frames.
+    """
+    chosen, kinds = renumber(batch[KIND].flatten())
+    count = kinds.bincount().double()
+    items: Items = {key: batch[key].flatten().index_select(0, chosen) for key in ("action", "action_log_prob")}
+    target = batch["value_target"].flatten().double()
+    mean_target = kinds.bincount(target) / count
+    items["value_target"] = mean_target.unsqueeze(-1)
+    items["advantage"] = (kinds.bincount(batch["advantage"].flatten().double()) / count).unsqueeze(-1)
+    items["spread"] = (target - mean_target.index_select(0, kinds)).square().mean()
+    items["count"] = count
+    return chosen, items
+
+
+def mean(values: Tensor, frames: Data) -> Tensor:
+    """Return the mean of values over frames, each as often as it counts; see `merge`."""
+    count = frames.get("count")
+    return values.mean() if count is None else (values.flatten() * count).sum() / count.sum()

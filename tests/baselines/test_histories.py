@@ -1,0 +1,150 @@
+"""Frames of one history are computed once: losses and gradients are those of all frames, but for rounding."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers.small_agents import agent_of, learnt_from, others_slow
+from torch import Tensor
+
+from baselines.parts import merge as merging
+from baselines.parts.merge import KIND, merge
+from baselines.parts.networks import HISTORY, INPUT
+from baselines.parts.policy_gradient import critic_loss
+from ctgraph_rl import CTGraphEnv
+from ctgraph_rl.learn.collect import collect
+from ctgraph_rl.packages import conf_dir
+from ctgraph_rl.runs.settings import names_in
+from curricula.paper import ct_su_b1
+
+NUMBERS = (INPUT, HISTORY, KIND)
+
+ONE, TWO = ct_su_b1((1, 2)), ct_su_b1((2, 1))
+NOISY = replace(ONE, observations=replace(ONE.observations, read_noise=10))
+WAITS = replace(ONE, graph=replace(ONE.graph, wait_prob=0.5))
+
+BATCHES = {
+    "several tasks with ids": ([ONE, TWO] * 8, {"ids": True}),
+    "one row": ([ONE], {}),
+    "all different": ([NOISY] * 16, {}),
+    "cut episodes": ([WAITS] * 16, {}),
+    "a short batch": ([ONE] * 16, {"steps": 3}),
+    "equal rows": ([ONE] * 16, {"equal": True}),
+}
+
+AGENTS = {
+    **{name: (name, ()) for name in ("a2c", "ppo", "ppo_count", "ppo_rnd", "reinforce", "rl2")},
+    **{f"lstm_ppo {cell}": ("lstm_ppo", (f"cell={cell}",)) for cell in names_in(conf_dir(), "cell")},
+    "lstm_ppo amrl straight": ("lstm_ppo", ("cell=amrl_max", "agent.cell.straight_through=true")),
+    "lstm_ppo reads": ("lstm_ppo", ("cell=lstm", "agent.cell.reads_action=true", "agent.cell.reads_reward=true")),
+}
+
+
+@pytest.fixture(autouse=True)
+def always(monkeypatch):
+    """Small batches go over their histories, too."""
+    monkeypatch.setattr(merging, "FEWEST_FRAMES", 0)
+    monkeypatch.setattr(merging, "LARGEST_SHARE", 2.0)
+
+
+def made(compose, name: str, kind: str, learn: int = 0) -> tuple:
+    """An agent that has learned from some batches, and a minibatch of one more, in which episodes go on."""
+    agent_name, overrides = AGENTS[name]
+    tasks, about = BATCHES[kind]
+    ids = {task: number for number, task in enumerate(dict.fromkeys(tasks))} if about.get("ids") else None
+    env = CTGraphEnv(tasks, seed=3, task_ids=ids)
+    rows = f"agent.num_envs={len(tasks)}"
+    minibatches = [] if agent_name in ("a2c", "reinforce") else ["agent.num_minibatches=1"]
+    agent = agent_of(compose, agent_name, env, rows, *minibatches, *overrides)
+    count = (learn + 1) * agent.num_steps + about.get("steps", agent.num_steps)
+    for number, batch in enumerate(
+        collect(env, agent.policy, len(tasks) * count, agent.num_steps, agent.initial_state)
+    ):
+        if about.get("equal"):
+            batch = torch.cat([batch[:1]] * len(tasks))
+        if number <= learn:
+            agent.learn(batch)
+    return agent, learnt_from(deepcopy(agent), batch)[0]
+
+
+def of_dtype(minibatch: dict, dtype: torch.dtype) -> dict:
+    return {key: value.to(dtype) if value.is_floating_point() else value for key, value in minibatch.items()}
+
+
+def computed(agent, minibatch: dict, dtype: torch.dtype, once: bool) -> tuple[dict[str, Tensor], Tensor]:
+    """The losses, and the gradient of their sum as one vector."""
+    agent = deepcopy(agent).to(dtype)
+    given = {key: value for key, value in of_dtype(minibatch, dtype).items() if once or key not in NUMBERS}
+    losses = agent.loss(given)
+    total = sum(value for key, value in losses.items() if key.startswith("loss_"))
+    gradients = torch.autograd.grad(total, list(agent.policy.parameters()))
+    return losses, torch.cat([gradient.flatten() for gradient in gradients])
+
+
+ALL_DIFFER = ("all different", "one row", "a short batch")
+CASES = [(name, kind) for name in AGENTS for kind in BATCHES]
+CHEAP = [("ppo", kind) for kind in BATCHES] + [
+    (name, "several tasks with ids") for name in ("a2c", "rl2", "lstm_ppo gru")
+]
+CHEAP += [("lstm_ppo lstm", kind) for kind in BATCHES]
+
+
+@pytest.mark.parametrize(("name", "kind"), others_slow(CASES, *CHEAP))
+def test_losses_and_gradients_of_histories_are_those_of_all_frames(compose, name, kind):
+    agent, minibatch = made(compose, name, kind)
+    if name not in ("a2c", "reinforce"):
+        minibatch["action_log_prob"] = minibatch["action_log_prob"] + 0.1 * (minibatch[KIND] % 5 - 2)
+
+    found, expected = (computed(agent, minibatch, torch.float64, once) for once in (True, False))
+
+    assert {KIND, HISTORY} <= minibatch.keys()
+    assert len(merge(minibatch)[0]) < minibatch["action"].numel() or kind in (
+        "all different",
+        "one row",
+        "a short batch",
+    )
+    torch.testing.assert_close(found, expected, atol=1e-10, rtol=1e-10)
+
+
+ROUNDED = [
+    (name, kind, learn) for name in AGENTS for kind in ("cut episodes", "several tasks with ids") for learn in (0, 60)
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "learn"), others_slow(ROUNDED, ("ppo", "cut episodes", 0), ("lstm_ppo lstm", "cut episodes", 0))
+)
+def test_histories_round_at_most_three_times_as_much_as_all_frames(compose, name, kind, learn):
+    agent, minibatch = made(compose, name, kind, learn)
+
+    exact, of_exact = computed(agent, minibatch, torch.float64, once=False)
+    plain, of_plain = computed(agent, minibatch, torch.float32, once=False)
+    found, of_found = computed(agent, minibatch, torch.float32, once=True)
+
+    unit = torch.finfo(torch.float32).eps
+    for key, value in exact.items():
+        assert (found[key] - value).abs() <= 3 * (plain[key] - value).abs() + 1e-4 * value.abs(), key
+    vectors = [torch.stack([losses[key].double() for key in exact]) for losses in (exact, plain, found)]
+    for correct, by_frames, by_histories in (vectors, (of_exact, of_plain, of_found)):
+        most = 3 * (by_frames - correct).norm() + 4 * unit * correct.norm()
+        assert (by_histories - correct).norm() <= most
+
+
+def test_a_critic_near_its_targets_is_not_lost_in_rounding():
+    generator = torch.Generator().manual_seed(0)
+    target = (100 + 0.01 * torch.randn(4096, 1, generator=generator, dtype=torch.float64)).float()
+    value = torch.full((4096, 1), 100.001)
+    kinds = torch.randint(3, (4096,), generator=generator)
+    zeros = torch.zeros(4096, dtype=torch.float32)
+    batch = {KIND: kinds, "action": kinds, "action_log_prob": zeros, "advantage": zeros, "value_target": target}
+
+    chosen, frames = merge(batch)
+    found = critic_loss(value[chosen], frames, 1.0)
+
+    naive = value[0].square() - 2 * value[0] * target.mean() + target.square().mean()
+    exact = (value.double() - target.double()).square().mean()
+    assert (found - exact).abs() <= 1e-7 * exact
+    assert (naive - exact).abs() > 0.5 * exact, "squares around 0 are lost in this case"
