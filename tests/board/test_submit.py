@@ -24,6 +24,7 @@ from ctgraph_rl.board.submission import log_sum, read_submission
 from ctgraph_rl.board.submission_rules import oracle_rule
 from ctgraph_rl.board.submit import submit
 from ctgraph_rl.log.files import locked_new
+from ctgraph_rl.log.provenance import NUMBERS
 from ctgraph_rl.log.saved import sum_of_state
 from ctgraph_rl.runs.config import plain
 
@@ -151,7 +152,10 @@ def other_metric(run: Path) -> None:
             "seeds 1 are missing: .*; seeds 100 are for tuning: track tiny-v1",
         ),
         (other_code, "runs are of different code, my_agent differs between them: run all with one"),
-        (other_numbers, r"has changed since the runs, ctgraph_rl \(numbers version 0 before, 1 now\): run again"),
+        (
+            other_numbers,
+            rf"has changed since the runs, ctgraph_rl \(numbers version 0 before, {NUMBERS} now\): run again",
+        ),
         (other_version, r"runs are of different versions, torch .* and 1.0: run all with one"),
         (unknown_code, "do not say of which source they are: run again from files, and with Recorder"),
         (

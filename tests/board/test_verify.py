@@ -21,6 +21,7 @@ from ctgraph_rl.board.relearn import Relearning, run_dir_of
 from ctgraph_rl.board.rerun import cells_of, draw, result_of
 from ctgraph_rl.board.rescore import Check
 from ctgraph_rl.board.submit import submit
+from ctgraph_rl.log.provenance import NUMBERS
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.runs.session import write_results
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -303,9 +304,10 @@ def test_runs_of_other_numbers_and_of_more_threads_than_cores_are_refused(tiny_s
     runs = tuple(replace(run, num_threads=4096) for run in tiny_submission.runs)
     with pytest.raises(ValueError, match=r"had 4096 threads, this machine has .* cores: verify it on a larger one"):
         cells_of(replace(tiny_submission, runs=runs), runs, tmp_path)
-    monkeypatch.setattr("ctgraph_rl.log.provenance.NUMBERS", 2)
+    monkeypatch.setattr("ctgraph_rl.log.provenance.NUMBERS", NUMBERS + 1)
     with pytest.raises(
-        ValueError, match="numbers version 1, this ctgraph_rl has 2: install the versions that submission"
+        ValueError,
+        match=f"numbers version {NUMBERS}, this ctgraph_rl has {NUMBERS + 1}: install the versions that submission",
     ):
         rerun.why_other_bits(tiny_submission, tiny_submission.runs)
 

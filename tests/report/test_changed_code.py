@@ -14,6 +14,7 @@ from rich.console import Console
 
 from ctgraph_rl import Recorder, RunLog, metrics
 from ctgraph_rl.log import provenance
+from ctgraph_rl.log.provenance import NUMBERS
 from ctgraph_rl.log.run_log import write_metrics
 from ctgraph_rl.report import page, results
 from ctgraph_rl.report.terminal import code_notes, mixed_code
@@ -175,11 +176,12 @@ def test_modules_that_an_agent_finds_only_once_it_is_imported_are_no_change(mine
 
 def test_another_numbers_version_of_the_package_makes_its_own_runs_stale(ran, monkeypatch, capsys):
     sweep(monkeypatch, "seed=20")
-    monkeypatch.setattr(provenance, "NUMBERS", 2)
+    monkeypatch.setattr(provenance, "NUMBERS", NUMBERS + 1)
     capsys.readouterr()
 
     assert sweep(monkeypatch, "seed=20") == 1
-    assert "  stale    seed=20  ctgraph_rl (numbers version 1 before, 2 now) changed" in printed(capsys)
+    said = f"ctgraph_rl (numbers version {NUMBERS} before, {NUMBERS + 1} now) changed"
+    assert f"  stale    seed=20  {said}" in printed(capsys)
 
 
 def test_a_finished_run_of_other_code_is_refused_and_not_shown(mine, ran, monkeypatch, capsys):
@@ -283,15 +285,15 @@ def test_runs_of_one_configuration_whose_curriculum_changed_are_named(mine, ran,
 
 def test_runs_of_an_older_numbers_version_are_named(ran, monkeypatch, capsys):
     sweep(monkeypatch, "seed=20,21")
-    monkeypatch.setattr("ctgraph_rl.log.provenance.NUMBERS", 2)
+    monkeypatch.setattr("ctgraph_rl.log.provenance.NUMBERS", NUMBERS + 1)
     capsys.readouterr()
 
     assert run_results(monkeypatch) == 0
-    said = "2 of 2 runs are of numbers version 1, this package is of 2: it may give other numbers"
+    said = f"2 of 2 runs are of numbers version {NUMBERS}, this package is of {NUMBERS + 1}: it may give other numbers"
     assert capsys.readouterr().err == f"code: {said}\n"
-    monkeypatch.setattr(provenance, "NUMBERS", 2)
     sweep(monkeypatch, "seed=22")
-    assert [agent for _, agent in grouped(all_runs(["runs"]))] == [f"LSTMPPO (numbers version {i})" for i in (1, 2)]
+    versions = [f"LSTMPPO (numbers version {number})" for number in (NUMBERS, NUMBERS + 1)]
+    assert [agent for _, agent in grouped(all_runs(["runs"]))] == versions
     assert run_results(monkeypatch) == 1
 
 
@@ -303,6 +305,7 @@ def without(path: Path, *names: str) -> None:
 
 
 def test_a_run_that_does_not_say_its_code_is_of_version_1_and_of_unknown_source(mine, ran, monkeypatch, capsys):
+    monkeypatch.setattr(provenance, "NUMBERS", 1)
     sweep(monkeypatch, "seed=20")
     sweep(monkeypatch, *MINE, "seed=20")
     for log in Path("runs").rglob("run.jsonl"):
@@ -355,6 +358,7 @@ def test_a_users_class_in_a_curriculum_counts(mine, ran, monkeypatch):
 
 
 def test_an_own_agent_that_changed_gets_new_experts_and_ours_keeps_its_own(mine, compose, monkeypatch):
+    monkeypatch.setattr(provenance, "NUMBERS", 1)
     keys = []
 
     def find(*arguments, **_):

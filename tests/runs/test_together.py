@@ -109,8 +109,9 @@ def test_each_seed_leaves_the_files_of_a_run_alone_and_says_which_seeds_were_bes
 def test_a_group_of_an_older_numbers_version_is_noticed_where_a_run_alone_has_not_changed():
     now = {"fingerprint": "0", "numbers": NUMBERS, "sources": {}}
 
-    assert code_changes({"numbers": 1}, now) == []
-    assert code_changes({"numbers": 1, "together": [0, 1]}, now) == ["ctgraph_rl (numbers version 1 before, 2 now)"]
+    said = f"ctgraph_rl (numbers version {NUMBERS} before, {NUMBERS_TOGETHER} now)"
+    assert code_changes({"numbers": NUMBERS}, now) == []
+    assert code_changes({"numbers": NUMBERS, "together": [0, 1]}, now) == [said]
 
 
 @pytest.mark.slow
