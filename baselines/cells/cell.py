@@ -96,7 +96,7 @@ class Cell(TakesNumbers, nn.Module):
             tree: the histories.
             inputs: [num_groups, num_inputs].
             groups: the group of each history's last inputs, int64 [num_histories].
-            state: what the histories of length 1 go on from; see `Tree.initial`.
+            state: what the histories of length 1 continue; see `Tree.initial`.
         """
         outputs = []
         first = 0

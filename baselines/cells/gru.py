@@ -9,6 +9,7 @@ from functools import partial
 
 import torch
 from torch import Tensor, nn
+from typing_extensions import override
 
 from baselines.cells.cell import Cell, CellOutput, CellState
 from baselines.cells.over_tree import GatedTree, GatesOverTree, GRUGates
@@ -41,8 +42,8 @@ class GRU(Cell):
         step = partial(gru_step, self.gru)
         return segments(starts).run(step, gru_inputs(self.gru, inputs), groups, state)
 
+    @override
     def over_tree(self, tree: Tree, inputs: Tensor, groups: Tensor, state: CellState) -> Tensor:
-        """See `Cell`; with a backward pass of its own."""
         _, of_h, _, bias = self.gru.all_weights[0]
         given = gru_inputs(self.gru, inputs)
         return GatesOverTree.apply(GatedTree(GRUGates, tree, groups), given, of_h, bias, *state)

@@ -9,6 +9,7 @@ from functools import partial
 
 import torch
 from torch import Tensor, nn
+from typing_extensions import override
 
 from baselines.cells.cell import Cell, CellOutput, CellState, of_frames, zeros_like_weights
 from baselines.cells.over_tree import GatedTree, GatesOverTree, LSTMGates
@@ -45,8 +46,8 @@ class LSTM(Cell):
         before = [value.squeeze(1) for value in state]
         return segments(starts).run(step, lstm_inputs(self.lstm, inputs), groups, before)
 
+    @override
     def over_tree(self, tree: Tree, inputs: Tensor, groups: Tensor, state: CellState) -> Tensor:
-        """See `Cell`; with a backward pass of its own."""
         given = lstm_inputs(self.lstm, inputs)
         parts = [value.squeeze(1) for value in state]
         gated = GatedTree(LSTMGates, tree, groups)

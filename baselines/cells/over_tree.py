@@ -1,6 +1,6 @@
-"""An LSTM or a GRU over a tree of histories, with a backward pass of its own.
+"""An LSTM or a GRU over a tree of histories, with one backward pass for all steps.
 
-PyTorch's would go back through every operation of every step. This one multiplies for all histories what it can.
+PyTorch's backward pass has every operation of every step. This one multiplies for all histories at once where it can.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from typing_extensions import override
 
 from baselines.cells.cell import CellState
 from ctgraph_rl.learn.histories import Tree
@@ -51,9 +52,9 @@ class Gates(Protocol):
 class LSTMGates(Gates):
     """i, f, g and o of an LSTM; its state is h and c."""
 
+    @override
     @staticmethod
     def step(given: Tensor, carried: Tensor, before: CellState) -> tuple[CellState, Kept]:
-        """See `Gates`."""
         size = before[1].shape[1]
         gates = carried.add_(given)
         g = gates[:, 2 * size : 3 * size].tanh()
@@ -63,9 +64,9 @@ class LSTMGates(Gates):
         squashed = c.tanh()
         return (o * squashed, c), (gates, g, squashed)
 
+    @override
     @staticmethod
     def factors(kept: Kept, before: CellState) -> Kept:
-        """See `Gates`."""
         gates, g, squashed = kept
         i, f, _, o = gates.chunk(4, dim=1)
         slope = gates * (1 - gates)
@@ -74,9 +75,9 @@ class LSTMGates(Gates):
         of_gates = torch.cat([g * slope_i, before[1] * slope_f, of_g, squashed * slope_o], dim=1)
         return of_gates, o * (1 - squashed.square()), f
 
+    @override
     @staticmethod
     def back(factors: Kept, by: CellState) -> tuple[Tensor, Tensor, CellState]:
-        """See `Gates`."""
         of_gates, of_h, f = factors
         by_h, by_c = by
         by_c = torch.addcmul(by_c, by_h, of_h)
@@ -87,27 +88,27 @@ class LSTMGates(Gates):
 class GRUGates(Gates):
     """r, z and n of a GRU; its state is h."""
 
+    @override
     @staticmethod
     def step(given: Tensor, carried: Tensor, before: CellState) -> tuple[CellState, Kept]:
-        """See `Gates`."""
         size = before[0].shape[1]
         r, z = (given[:, : 2 * size] + carried[:, : 2 * size]).sigmoid().chunk(2, dim=1)
         of_h = carried[:, 2 * size :]
         n = torch.addcmul(given[:, 2 * size :], r, of_h).tanh()
         return (torch.lerp(n, before[0], z),), (r, z, n, of_h)
 
+    @override
     @staticmethod
     def factors(kept: Kept, before: CellState) -> Kept:
-        """See `Gates`."""
         r, z, n, of_h = kept
         of_n = (1 - z) * (1 - n.square())
         of_r = of_n * of_h * r * (1 - r)
         of_z = (before[0] - n) * z * (1 - z)
         return torch.cat([of_r, of_z, of_n], dim=1), torch.cat([of_r, of_z, of_n * r], dim=1), z
 
+    @override
     @staticmethod
     def back(factors: Kept, by: CellState) -> tuple[Tensor, Tensor, CellState]:
-        """See `Gates`."""
         of_given, of_carried, z = factors
         by_gates = torch.cat([by[0], by[0], by[0]], dim=1)
         return by_gates * of_given, by_gates * of_carried, (by[0] * z,)
@@ -147,7 +148,7 @@ class GatesOverTree(torch.autograd.Function):
             given: the products of inputs, [n, G].
             weight: of the first part of the state, [G, H].
             bias: of that product, [G], or None.
-            initial: what the histories of length 1 go on from, [n, H] each; it comes from data and has no gradient.
+            initial: what the histories of length 1 continue, [n, H] each; it comes from data and has no gradient.
         """
         gates, tree, inputs = gated
         states = [torch.cat([part, part.new_empty(len(inputs), part.shape[1])]) for part in initial]
@@ -171,7 +172,7 @@ class GatesOverTree(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, by_outputs: Tensor) -> tuple[Any, ...]:  # type: ignore[override]
+    def backward(ctx: Any, by_outputs: Tensor) -> tuple[Any, ...]:
         """Return the gradients by the products, the weight and the bias."""
         gates, tree, inputs = ctx.gated
         given, weight, *states = ctx.saved_tensors

@@ -1,6 +1,6 @@
 """Frames of one history as one: which losses sum up, so that each is computed once.
 
-Used on CPUs where a batch has few histories, as without noise on reading. The choice depends on the batch alone.
+Used on CPUs where a batch has few histories, as without noise on reading. The choice depends only on the batch.
 """
 
 from __future__ import annotations

@@ -185,19 +185,19 @@ class RecurrentModule(TensorDictModuleBase):
         seen = [data[key] for key in self.encoder.in_keys]
         own = self._own(data)
         state = reset([data[key] for key in self.state_keys], data["is_init"].squeeze(-1))
-        groups = None
-        if len(seen[0]) >= FEWEST_ROWS:
+        num_rows = len(seen[0])
+        if num_rows >= FEWEST_ROWS:
             examples, groups = distinct([*seen, *own, *state], most=MOST_ROWS)
-            if len(examples) < len(groups):
-                seen, own, state = (_rows(values, examples) for values in (seen, own, state))
-            else:
-                groups = None
-        memory, state = self.cell.step(joined(self.encoder.module(*seen), *own), tuple(state))
-        if groups is not None:
-            memory, *state = _rows([memory, *state], groups)
+            if len(examples) < num_rows:
+                seen = [value.index_select(0, examples) for value in seen]
+                own = [value.index_select(0, examples) for value in own]
+                state = tuple(value.index_select(0, examples) for value in state)
+        memory, state = self.cell.step(joined(self.encoder.module(*seen), *own), state)
         written: Items = {"memory": memory}
         for key, value in zip(self.state_keys, state, strict=True):
             written["next", key] = value
+        if len(memory) < num_rows:
+            written = {key: value.index_select(0, groups) for key, value in written.items()}
         return written
 
     def over_time(self, data: Data) -> Tensor:
@@ -258,10 +258,6 @@ class RecurrentModule(TensorDictModuleBase):
             value = one_hot(data[key], self.cell.num_actions).float() if key == PREVIOUS_ACTION else data[key]
             found.append(value * ~data["is_init"])
         return found
-
-
-def _rows(values: Sequence[Tensor], rows: Tensor) -> list[Tensor]:
-    return [value.index_select(0, rows) for value in values]
 
 
 def trunk_of(policy: object) -> Any:

@@ -2,7 +2,7 @@
 
 Without noise on reading, thousands of frames show a few images, and what an agent with memory has seen since an episode
 began is one of a few sequences: 26 in 8,192 frames of CT-SU-B1. Histories are numbered, and equal numbers are equal
-histories. A history goes on from one that is a step shorter, so all together are a tree. One that an earlier batch
+histories. A history continues one that is a step shorter, so all together are a tree. One that an earlier batch
 began starts from the stored state of its row.
 """
 
@@ -35,7 +35,7 @@ def distinct(values: Sequence[Tensor], most: float = 1.0) -> tuple[Tensor, Tenso
 
     Returns:
         One row of each group, int64 [num_groups], and the group of each row, int64 [num_rows]. Each row is a group
-        where more would be different, as they are with noise on reading, and where code must not branch on values.
+        where more differ, as with noise on reading, and where code must not branch on values.
     """
     rows = torch.arange(len(values[0]), device=values[0].device)
     if not can_branch(values[0]) or not len(rows):
@@ -94,7 +94,7 @@ class Tree(NamedTuple):
     """A frame at which each ends, int64 [num_histories]."""
 
     shorter: Tensor
-    """What each goes on from: its place among the states of `initial`, followed by the histories; int64."""
+    """What each continues: its place among the states of `initial`, followed by the histories; int64."""
 
     sizes: list[int]
     """How many histories there are of each length."""
@@ -103,7 +103,7 @@ class Tree(NamedTuple):
     """The history of each frame, int64 [rows * steps]."""
 
     def initial(self, starts: Tensor, state: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """Return the states that histories of length 1 go on from; arguments as of `number_histories`."""
+        """Return the states that histories of length 1 continue; arguments as of `number_histories`."""
         frames = self.frames[: self.sizes[0]]
         goes_on = ~starts.flatten().index_select(0, frames)
         rows = frames // starts.shape[1]

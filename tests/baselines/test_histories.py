@@ -51,7 +51,7 @@ def always(monkeypatch):
 
 
 def made(compose, name: str, kind: str, learn: int = 0) -> tuple:
-    """An agent that has learned from some batches, and a minibatch of one more, in which episodes go on."""
+    """An agent that has learned from some batches, and a minibatch of one more, in which episodes continue."""
     agent_name, overrides = AGENTS[name]
     tasks, about = BATCHES[kind]
     ids = {task: number for number, task in enumerate(dict.fromkeys(tasks))} if about.get("ids") else None

@@ -1,4 +1,4 @@
-"""Histories: which frames of a batch have the same, which go on from which, and what a part of a batch has of them."""
+"""Histories: which frames of a batch have the same, which continue which, and what a part of a batch has of them."""
 
 from __future__ import annotations
 
