@@ -28,7 +28,7 @@ _HOMES = {
     "from_axes": "configured",
     "from_graph": "configured",
     "from_meta_json": "meta_json",
-    "sequence": "order",
+    "sequence": "axes",
 }
 
 __all__ = ["MISSING", "from_axes", "from_graph", "from_meta_json", "load", "names", "sequence", "summary"]

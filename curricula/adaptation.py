@@ -12,9 +12,8 @@ from ctgraph_rl.tasks.images import OneHot, PaperImages
 from ctgraph_rl.tasks.observations import Observations
 from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from ctgraph_rl.tasks.task import Task
-from curricula.axes import all_goals, given_goals, random_goals, reshaped
+from curricula.axes import OneOrMore, Tasks, all_goals, cycle, given_goals, random_goals, reshaped, sequence
 from curricula.draws import below, generator
-from curricula.order import OneOrMore, Tasks, cycle, sequence
 from curricula.published import environment, full_mdp, goal_of
 
 SWOKS = "Dick et al. 2024, CoLLAs, arXiv 2405.19047; github.com/JupiLogy/swoks"

@@ -1,4 +1,4 @@
-"""The axes along which tasks differ; the ways to put tasks in order of `curricula.order` are here, too.
+"""The axes along which tasks differ, and the ways to put tasks in order.
 
 An axis takes a task, or several, and returns the variations of each, those of the first task first. So axes combine by
 applying one to what another returns: ``all_goals(image_seeds(task, (1, 2)))`` is every goal with the images of seed 1,
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import random
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, replace
 from math import prod
 from typing import Any
@@ -18,22 +18,35 @@ from ctgraph_rl.checks import NamedValues, as_tuple, is_int, require, require_al
 from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.tasks.configurations import OBSERVABILITY as OBSERVABILITY
 from ctgraph_rl.tasks.configurations import observations_of
+from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import ImageSet, PaperImages
+from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
+from ctgraph_rl.tasks.switch import Switch
 from ctgraph_rl.tasks.task import Task
-from curricula.draws import below, different, generator
-from curricula.order import MOST_TASKS, OneOrMore, Tasks, each
-from curricula.order import as_tasks as as_tasks
-from curricula.order import concatenate as concatenate
-from curricula.order import cycle as cycle
-from curricula.order import interleave as interleave
-from curricula.order import product as product
-from curricula.order import repeat as repeat
-from curricula.order import reverse as reverse
-from curricula.order import sequence as sequence
-from curricula.order import shuffle as shuffle
-from curricula.order import split as split
+from curricula.draws import below, different, generator, shuffled
 
 MOVABLE = ("home", "fail", "wait", "decision", "end")
+
+Tasks = tuple[Task, ...]
+OneOrMore = Task | Iterable[Task]
+Axis = Callable[[Tasks], Tasks]
+
+MOST_TASKS = 100_000
+"""More tasks than this are refused before they are built."""
+
+
+def as_tasks(tasks: OneOrMore) -> Tasks:
+    """A task or several as a tuple.
+
+    Raises:
+        ValueError: for anything else, and for no task.
+    """
+    return (tasks,) if isinstance(tasks, Task) else require_all(Task, "tasks", tasks)
+
+
+def each(tasks: OneOrMore, vary: Callable[[Task], Iterable[Task]]) -> Tasks:
+    """Return the variations of each task, those of the first task first."""
+    return tuple(itertools.chain.from_iterable(map(vary, as_tasks(tasks))))
 
 
 # goal location
@@ -328,3 +341,112 @@ def _with_room(images: ImageSet, num_images: int, exact: bool = False) -> ImageS
     settable = "num_images" in {field.name for field in fields(images) if field.init}  # type: ignore[arg-type]
     fits = images.num_images == num_images if exact else images.num_images >= num_images
     return images if fits or not settable else replace(images, num_images=num_images)  # type: ignore
+
+
+# order
+
+
+def product(tasks: OneOrMore, *axes: Axis) -> Tasks:
+    """Axes applied one after the other: the last one varies fastest."""
+    varied = as_tasks(tasks)
+    for axis in axes:
+        varied = axis(varied)
+    return varied
+
+
+def concatenate(*sequences: OneOrMore) -> Tasks:
+    """One sequence after the other."""
+    return tuple(itertools.chain.from_iterable(map(as_tasks, sequences)))
+
+
+def interleave(*sequences: OneOrMore) -> Tasks:
+    """The first task of each sequence, then the second of each; a sequence that has ended is left out.
+
+    Example:
+        >>> from ctgraph_rl.tasks.configurations import ct_su_b1
+        >>> a, b, c = (ct_su_b1(goal=goal) for goal in ((1, 1), (1, 2), (2, 1)))
+        >>> [task.goal for task in interleave((a, b), c)]
+        [(1, 1), (2, 1), (1, 2)]
+    """
+    rounds = itertools.zip_longest(*map(as_tasks, sequences))
+    return tuple(filter(None, itertools.chain.from_iterable(rounds)))
+
+
+@takes_numbers
+def repeat(tasks: OneOrMore, times: int) -> Tasks:
+    """Each task several times in a row: A A B B."""
+    _check_times(times)
+    return each(tasks, lambda task: [task] * times)
+
+
+@takes_numbers
+def cycle(tasks: OneOrMore, times: int) -> Tasks:
+    """The whole sequence several times: A B A B."""
+    _check_times(times)
+    return as_tasks(tasks) * times
+
+
+def _check_times(times: object) -> None:
+    require((is_int(times, 1, MOST_TASKS), f"times must be an integer >= 1, got {times!r}"))
+
+
+@takes_numbers
+def shuffle(tasks: OneOrMore, seed: int) -> Tasks:
+    """The tasks in an order drawn uniformly from a seed, an integer >= 0."""
+    return tuple(shuffled(as_tasks(tasks), seed))
+
+
+def reverse(tasks: OneOrMore) -> Tasks:
+    """The last task first."""
+    return as_tasks(tasks)[::-1]
+
+
+@takes_numbers
+def split(tasks: OneOrMore, num_held_out: int, seed: int) -> tuple[Tasks, Tasks]:
+    """Tasks to train and tasks to hold out, drawn without replacement; both keep their order.
+
+    Args:
+        tasks: different tasks.
+        num_held_out: how many to hold out, fewer than there are.
+        seed: an integer >= 0.
+    """
+    everything = as_tasks(tasks)
+    count = len(everything)
+    require(
+        (is_int(num_held_out, 1, count - 1), f"num_held_out must be in 1..{count - 1}, got {num_held_out!r}"),
+        (len(set(everything)) == count, "tasks to split must differ, else a task is both trained and held out"),
+    )
+    held_out = set(shuffled(range(count), seed)[:num_held_out])
+    rest = tuple(task for i, task in enumerate(everything) if i not in held_out)
+    return rest, tuple(everything[i] for i in sorted(held_out))
+
+
+@takes_numbers
+def sequence(
+    name: str,
+    tasks: Iterable[OneOrMore],
+    num_frames: int | Sequence[int],
+    version: int = 1,
+    source: str = "",
+    protocol: Protocol | None = None,
+    evaluation: Evaluation | None = None,
+    switch: Switch | None = None,
+) -> Curriculum:
+    """A curriculum with a block for each item.
+
+    Args:
+        name: name that a paper cites.
+        tasks: a task, or several that share a block, for each block.
+        num_frames: frames of every block, or a list with those of each.
+        version: raised when the content changes.
+        source: where the sequence comes from.
+        protocol: what the learner knows of tasks; None: no task ids, announced boundaries.
+        evaluation: how performance is measured; None: the defaults of `Evaluation`.
+        switch: how rows change between the tasks of a block.
+    """
+    items = [tasks] if isinstance(tasks, Task) else list(tasks)
+    frames = as_tuple(num_frames)
+    budgets = frames if isinstance(frames, tuple) else (num_frames,) * len(items)
+    require((len(budgets) == len(items), f"num_frames must be one for each of {len(items)} blocks, got {len(budgets)}"))
+    blocks = tuple(Block(as_tasks(item), n, switch) for item, n in zip(items, budgets, strict=True))
+    return Curriculum(name, version, source, blocks, evaluation or Evaluation(), protocol=protocol or Protocol())

@@ -1,7 +1,7 @@
 """Curricula whose axes are plain arguments, so that a command line can set them.
 
-Where blocks have equally many frames, a multiple of 2,048, and at most `MOST_TASKS` tasks, evaluations come eight times
-in a block, so that the speed of learning is seen.
+Evaluations come eight times in a block, so that the speed of learning is seen: where there are at most `MOST_EVALUATED`
+tasks, and all blocks have the same number of frames, a multiple of 2,048.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ctgraph_rl.tasks.reference import read_task
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift
 from ctgraph_rl.tasks.task import Task
 from curricula import axes
-from curricula.order import Tasks
+from curricula.axes import Tasks
 from curricula.paper import KINDS, configured
 
 GOALS = ("all", "random", "nested")
@@ -40,7 +40,7 @@ EVALUATIONS = 8
 ROWS = 256
 """Environments that an evaluation within a block must fit; most agents have as many or a divisor."""
 
-MOST_TASKS = 20
+MOST_EVALUATED = 20
 """Of a curriculum with evaluations within blocks, as each evaluates all tasks."""
 
 TRIALS = 50
@@ -327,7 +327,7 @@ def _curriculum(
         require((in_order, rule))
         tasks = tuple(replace(task, goal_change=pair) for task in tasks)
     every = 0
-    if isinstance(num_frames, int) and len(set(tasks)) <= MOST_TASKS and num_frames % (EVALUATIONS * ROWS) == 0:
+    if isinstance(num_frames, int) and len(set(tasks)) <= MOST_EVALUATED and num_frames % (EVALUATIONS * ROWS) == 0:
         every = num_frames // EVALUATIONS
     evaluation = Evaluation(every=every)
     change = tasks[0].goal_change

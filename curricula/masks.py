@@ -21,7 +21,7 @@ from typing import NamedTuple
 from ctgraph_rl.checks import by_name, is_int, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Evaluation
-from curricula.order import sequence
+from curricula.axes import sequence
 from curricula.published import MASK_EVALUATION, GoalPool, NamedTasks, chosen, labelled, one_wait_image, pool_ids, words
 
 MASKS = "Ben-Iwhiwhu et al. 2023, arXiv 2212.11110; github.com/dlpbc/mask-lrl"

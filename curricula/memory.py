@@ -15,7 +15,7 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import PaperImages
 from ctgraph_rl.tasks.observations import Observations
 from ctgraph_rl.tasks.task import Task
-from curricula.order import sequence
+from curricula.axes import sequence
 
 SOURCE = "Ladosz et al. 2021; the numbers of its graph in Soltoggio et al. 2023, arXiv 2302.10887"
 

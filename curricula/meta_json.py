@@ -24,7 +24,7 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Protocol
 from ctgraph_rl.tasks.reference import read_task
 from ctgraph_rl.tasks.task import Task
-from curricula.order import MOST_TASKS, sequence
+from curricula.axes import MOST_TASKS, sequence
 from curricula.published import one_id_each
 
 MOST_BYTES = 4 * 2**20

@@ -23,7 +23,7 @@ from ctgraph_rl.tasks.protocol import Block, Evaluation
 from ctgraph_rl.tasks.switch import ByEpisode
 from ctgraph_rl.tasks.task import Task
 from curricula import axes
-from curricula.order import OneOrMore
+from curricula.axes import Tasks
 
 PAPER = "Soltoggio et al. 2023, arXiv 2302.10887"
 
@@ -40,6 +40,22 @@ READ_NOISE = 10
 
 READ_ROTATION = 5
 """Largest rotation when an image is read, in degrees; Table 3 of the paper has 0 or 5."""
+
+VERSION_2 = [
+    "posr_b1_4tasks",
+    "posr_b1_depth2to5",
+    "posr_b1_uncorrelated",
+    "su_b1_4images",
+    "su_b1_new_decisions",
+    "su_b1_new_waits",
+    "co_b1_4images",
+    "co_b1_new_decisions",
+    "co_b1_new_waits",
+    "posr_b1_4images",
+    "posr_b1_new_decisions",
+    "posr_b1_new_waits",
+]
+"""What changed: CT-POSR-B1 had noise in its rewards, and a single goal needed no memory."""
 
 MOST_DEPTH = 4
 """Changing goals are all tasks of one batch and evaluated for whole trials, so deeper graphs are refused."""
@@ -79,7 +95,7 @@ def goal_location(configuration: str, num_frames: int = FRAMES, image_seed: int 
         image_seed: seed of the image set that all tasks share.
     """
     tasks = axes.all_goals(configured(configuration, image_seed))
-    return _curriculum(f"{configuration}_{len(tasks)}tasks", tasks, num_frames, _version(configuration))
+    return _curriculum(f"{configuration}_{len(tasks)}tasks", tasks, num_frames)
 
 
 def instances(
@@ -119,7 +135,7 @@ def depth_growth(configuration: str, num_frames: int = FRAMES, image_seed: int =
     task = configured(configuration, image_seed)
     deepest = axes.reshaped(task, replace(task.graph, depth=DEPTHS[-1]), KINDS[configuration], DEEPEST_GOAL)
     tasks = axes.growing_depth(deepest, DEPTHS)
-    return _curriculum(f"{configuration}_depth2to5", tasks, num_frames, _version(configuration))
+    return _curriculum(f"{configuration}_depth2to5", tasks, num_frames)
 
 
 def input_variation(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
@@ -131,8 +147,7 @@ def input_variation(configuration: str, num_frames: int = FRAMES, image_seed: in
         image_seed: seed of the first image set; the others have the next three.
     """
     tasks = axes.image_seeds(one_goal(configuration), _seeds(image_seed))
-    version = _version(configuration, has_one_goal=True)
-    return _curriculum(f"{configuration}_{NUM_VARIATIONS}images", tasks, num_frames, version)
+    return _curriculum(f"{configuration}_{NUM_VARIATIONS}images", tasks, num_frames)
 
 
 def uncorrelated(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
@@ -148,7 +163,7 @@ def uncorrelated(configuration: str, num_frames: int = FRAMES, image_seed: int =
     shown = axes.image_seeds(configured(configuration), _seeds(image_seed))
     goals = axes.random_goals(shown[0], NUM_VARIATIONS, image_seed)
     tasks = [replace(task, goal=other.goal) for task, other in zip(shown, goals, strict=True)]
-    return _curriculum(f"{configuration}_uncorrelated", tasks, num_frames, _version(configuration))
+    return _curriculum(f"{configuration}_uncorrelated", tasks, num_frames)
 
 
 def dissimilar(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
@@ -198,8 +213,7 @@ def new_waits(configuration: str, num_frames: int = FRAMES, image_seed: int = 1)
 
 def _with_new_images(configuration: str, kind: str, num_frames: int, image_seed: int) -> Curriculum:
     tasks = axes.new_images(one_goal(configuration, image_seed), NUM_VARIATIONS, (kind,))
-    version = _version(configuration, has_one_goal=True)
-    return _curriculum(f"{configuration}_new_{kind}s", tasks, num_frames, version)
+    return _curriculum(f"{configuration}_new_{kind}s", tasks, num_frames)
 
 
 def similar_goals(name: str, depth: int, num_shared: int, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
@@ -344,13 +358,8 @@ def _seeds(first: int) -> range:
     return range(first, first + NUM_VARIATIONS)
 
 
-def _version(configuration: str, has_one_goal: bool = False) -> int:
-    """Return 2 for what changed: CT-POSR-B1 had noise in its rewards, and a single goal needed no memory."""
-    return 2 if configuration == "posr_b1" or (has_one_goal and KINDS[configuration] != "full") else 1
-
-
-def _curriculum(name: str, tasks: OneOrMore, num_frames: int, version: int = 1) -> Curriculum:
-    return axes.sequence(name, [tasks] if isinstance(tasks, Task) else tasks, num_frames, version, PAPER)
+def _curriculum(name: str, tasks: Tasks | list[Task], num_frames: int) -> Curriculum:
+    return axes.sequence(name, tasks, num_frames, 2 if name in VERSION_2 else 1, PAPER)
 
 
 WAYS = {

@@ -21,9 +21,8 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import PaperImages
 from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from ctgraph_rl.tasks.task import Task
-from curricula.axes import all_goals, given_goals, growing_depth
+from curricula.axes import OneOrMore, all_goals, as_tasks, given_goals, growing_depth, sequence
 from curricula.memory import co_hard
-from curricula.order import OneOrMore, as_tasks, sequence
 
 SOURCE = "ctgraph_rl, after section 1 of Soltoggio et al. 2023, arXiv 2302.10887"
 

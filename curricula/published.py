@@ -14,7 +14,7 @@ from ctgraph_rl.checks import NamedValues, is_int, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from ctgraph_rl.tasks.task import Task
-from curricula.order import Tasks, sequence
+from curricula.axes import Tasks, sequence
 
 NamedTasks = list[tuple[int, str]]
 """Tasks as the labs write them: image seed, and path."""

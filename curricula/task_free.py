@@ -16,8 +16,7 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Block, Protocol
 from ctgraph_rl.tasks.switch import Drift
 from ctgraph_rl.tasks.task import Task
-from curricula.axes import all_goals, image_seeds
-from curricula.order import sequence
+from curricula.axes import all_goals, image_seeds, sequence
 
 TASK_FREE = "ctgraph_rl, after Zeno et al. 2018, arXiv 1803.10123, and Aljundi et al. 2019, arXiv 1812.03596"
 

@@ -18,7 +18,6 @@ from ctgraph_rl.checks import (
     LARGEST_INT,
     NamedValues,
     ReadOnlyValues,
-    Rule,
     as_path,
     is_int,
     make_fields_plain,
@@ -81,8 +80,26 @@ class Curriculum:
             (isinstance(self.protocol, Protocol), f"protocol must be a Protocol, got {self.protocol!r}"),
         )
         self.protocol.ids(len(self.tasks))
-        require(*are_tasks("tasks", (*self.tasks, *self.evaluation.held_out)))
-        require(*self._task_rules())
+        everything = (*self.tasks, *self.evaluation.held_out)
+        require(*are_tasks("tasks", everything))
+        shapes = list(dict.fromkeys(task.observation_shape for task in everything))
+        actions = list(dict.fromkeys(task.num_actions for task in everything))
+        pads = are_graphs(everything)
+        one_shape = len(shapes) == 1 or (pads and max(map(len, shapes)) == 1)
+        trained = set(self.tasks)
+        trained_too = [task for task in self.evaluation.held_out if task in trained]
+        one_each = self.protocol.task_id != "at_boundaries" or max(map(len, self.trained)) == 1
+        how = self.evaluation
+        at_once = how.before and (how.tasks == "all" or bool(how.held_out))
+        evaluates = how.at_block_ends or at_once or 0 < how.every <= self.num_frames
+        require(
+            (one_shape, f"all tasks of a curriculum must show observations of one shape, got {shapes}"),
+            (pads or len(actions) == 1, f"all tasks of a curriculum must have as many actions, got {actions}"),
+            (not trained_too, f"held_out tasks must not be trained, got {trained_too[:3]}"),
+            (self.num_frames <= LARGEST_INT, f"the blocks have {self.num_frames:,} frames together, at most 2**63 - 1"),
+            (one_each, "task ids given at_boundaries need blocks of one task each"),
+            (evaluates, "nothing would be evaluated: set before, every or at_block_ends"),
+        )
 
     def __repr__(self) -> str:
         return f"<Curriculum {self._summary}>"
@@ -105,27 +122,6 @@ class Curriculum:
     def _summary(self) -> str:
         sizes = f"tasks: {len(self.tasks):,}, blocks: {len(self.blocks):,}, frames: {self.num_frames:,}"
         return f"{self.name!r}, version {self.version}, {sizes}"
-
-    def _task_rules(self) -> list[Rule]:
-        everything = (*self.tasks, *self.evaluation.held_out)
-        shapes = list(dict.fromkeys(task.observation_shape for task in everything))
-        actions = list(dict.fromkeys(task.num_actions for task in everything))
-        pads = are_graphs(everything)
-        one_shape = len(shapes) == 1 or (pads and max(map(len, shapes)) == 1)
-        trained = set(self.tasks)
-        trained_too = [task for task in self.evaluation.held_out if task in trained]
-        one_each = self.protocol.task_id != "at_boundaries" or max(map(len, self.trained)) == 1
-        how = self.evaluation
-        at_once = how.before and (how.tasks == "all" or bool(how.held_out))
-        evaluates = how.at_block_ends or at_once or 0 < how.every <= self.num_frames
-        return [
-            (one_shape, f"all tasks of a curriculum must show observations of one shape, got {shapes}"),
-            (pads or len(actions) == 1, f"all tasks of a curriculum must have as many actions, got {actions}"),
-            (not trained_too, f"held_out tasks must not be trained, got {trained_too[:3]}"),
-            (self.num_frames <= LARGEST_INT, f"the blocks have {self.num_frames:,} frames together, at most 2**63 - 1"),
-            (one_each, "task ids given at_boundaries need blocks of one task each"),
-            (evaluates, "nothing would be evaluated: set before, every or at_block_ends"),
-        ]
 
     @cached_property
     def tasks(self) -> tuple[TaskLike, ...]:

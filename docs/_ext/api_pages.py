@@ -63,7 +63,7 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "curricula": (
         "Curricula",
         "Published sequences by name, and functions that make others.",
-        ("curricula", "curricula.axes", "curricula.order", "curricula.configured", "curricula.meta_json"),
+        ("curricula", "curricula.axes", "curricula.axes", "curricula.configured", "curricula.meta_json"),
     ),
     "metrics": (
         "Metrics",
