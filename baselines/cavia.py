@@ -35,13 +35,13 @@ class Context(InnerModel):
         super().__init__(net, inner_rate)
         self.num_context = num_context
 
+    @override
     def start(self, theta: NamedWeights) -> NamedWeights:
-        """Return a context of zeros."""
         like = next(iter(theta.values()))
         return {"context": like.new_zeros(self.num_context)}
 
+    @override
     def logits(self, theta: NamedWeights, own: NamedWeights, seen: NetInputs) -> Tensor:
-        """Compute the logits from theta and a trial's context."""
         context = own["context"].expand(*seen[0].shape[: -self.net.event_dims], -1)
         return functional_call(self.net, theta, (*seen, context))
 
@@ -64,8 +64,8 @@ class CAVIA(InnerLoop):
     solves = "tasks whose goal is drawn from several: it adapts a context after some episodes"
 
     @property
+    @override
     def num_context(self) -> int:
-        """Inputs of the network beside observations."""
         return self.settings.num_context
 
     @override

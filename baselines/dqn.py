@@ -101,7 +101,7 @@ class DQN(QLearner):
         mean = squared.mean() if weight is None else (squared * weight).sum() / weight.sum()
         return {"loss_value": mean, "td_error": squared.detach()}
 
+    @override
     def values(self, data: Data) -> Tensor:
-        """Compute the online network's action values."""
         trunk, head = self.greedy.module[0].module
         return head.module(trunk.over_time(data))

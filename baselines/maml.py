@@ -21,12 +21,12 @@ from baselines.parts.inner_loop import InnerLoop, InnerModel, NamedWeights, NetI
 class AllWeights(InnerModel):
     """Every weight of the network adapts."""
 
+    @override
     def start(self, theta: NamedWeights) -> NamedWeights:
-        """Return theta."""
         return theta
 
+    @override
     def logits(self, theta: NamedWeights, own: NamedWeights, seen: NetInputs) -> Tensor:
-        """Compute the logits from a trial's own weights."""
         return functional_call(self.net, own, seen)
 
 

@@ -284,18 +284,19 @@ class MOHQA(QLearner):
         state = {"eligibility": weights.new_zeros(num_envs, *weights.shape), "average": average.clone()}
         return TensorDict({**state, "trial": weights.new_zeros(num_envs, 1)}, batch_size=[num_envs])
 
+    @override
     def reset_parameters(self) -> None:
-        """See `Learner`; the weights of the Hebbian network and the average are 0 again."""
+        """The weights of the Hebbian network and the average are 0 again."""
         super().reset_parameters()
         self.hebbian.weights.zero_()
         self.average.zero_()
 
+    @override
     def other_weights(self) -> TensorsByName:
-        """Return all weights of the target network."""
         return {**super().other_weights(), "hebbian.weights": self.target_weights}
 
+    @override
     def weights_changed(self) -> None:
-        """Copy all weights to the target network."""
         super().weights_changed()
         self.target_weights.copy_(self.hebbian.weights)
 
@@ -310,8 +311,9 @@ class MOHQA(QLearner):
         self.average.copy_(batch["next", "average"][:, -1].mean(dim=0))
         yield from super().minibatches(batch)
 
+    @override
     def with_targets(self, batch: TensorDictBase) -> TensorDictBase:
-        """See `QLearner`; one step needs none of `MultiStep`'s operations, which take long for a batch of one step."""
+        """One step needs none of `MultiStep`'s operations, which take long for a batch of one step."""
         if self.multi_step.n_steps > 1:
             return super().with_targets(batch)
         steps = torch.ones(batch.shape, dtype=torch.int64, device=batch.device)

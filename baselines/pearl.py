@@ -34,6 +34,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.nn.functional import one_hot, softplus
 from torchrl.data import Composite, TensorSpec
+from typing_extensions import override
 
 from baselines.parts.gates import GATES, GatedNetwork, gated_network, require_gated_weights, shown_specs
 from baselines.parts.inner_loop import NetInputs, places
@@ -271,8 +272,8 @@ class PEARL(Learner):
         step = (first + (share * (last + 1 - first)).long()).minimum(last)
         return {key: value[row, step] for key, value in self.replay.items() if key != "begins"}
 
+    @override
     def other_weights(self) -> TensorsByName:
-        """Return the target critics' weights."""
         return {f"critics.{name}": value for name, value in self.targets.named_parameters()}
 
     def loss(self, batch: Data, others: Data | None = None) -> TensorsByName:
@@ -311,22 +312,22 @@ class PEARL(Learner):
         precision, weighted = self.policy.evidence(seen, *given)
         return gaussian(precision.sum(dim=1), weighted.sum(dim=1))
 
+    @override
     @torch.no_grad()
     def after_update(self, measured: TensorsByName) -> TensorsByName:
-        """Let the target critics follow."""
         for target, online in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
             target.lerp_(online, self.settings.target_rate)
         return measured
 
+    @override
     def weights_changed(self) -> None:
-        """Copy the weights to the target critics."""
         self.targets.load_state_dict(self.critics.state_dict())
 
+    @override
     def get_extra_state(self) -> NamedValues:
-        """Return the optimiser's state and replay."""
         return {**super().get_extra_state(), "replay": self.replay}
 
+    @override
     def set_extra_state(self, state: NamedValues) -> None:
-        """Restore what `get_extra_state` returned."""
         super().set_extra_state(state)
         self.replay = state["replay"]

@@ -38,6 +38,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.nn.functional import mse_loss, pad
 from torchrl.data import Composite, TensorSpec
+from typing_extensions import override
 
 from baselines.cells.cell import linear_layer
 from baselines.parts.networks import Data, TensorsByName, guided, highest, is_greedy, num_actions_of, require_weights
@@ -464,8 +465,8 @@ class PennA(TensorDictModuleBase):
         require_finite("loss_autoencoder", total)
         return total.item() / self.settings.num_updates
 
+    @override
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> PennA:
-        """Move the population with everything else."""
         self.population = Population(*map(fn, self.population))
         return super()._apply(fn, recurse)
 
@@ -475,8 +476,8 @@ class PennA(TensorDictModuleBase):
         state["optimiser"] = self.optimiser.state_dict()
         return state
 
+    @override
     def set_extra_state(self, state: NamedValues) -> None:
-        """Restore what `get_extra_state` returned."""
         self.population = Population(**state["population"])
         self.generation = state["generation"]
         self.lived = state["lived"]

@@ -29,6 +29,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
+from typing_extensions import override
 
 from baselines.cells.cell import linear_layer
 from baselines.parts.networks import Data, Items, TensorsByName, critic, encoder, highest
@@ -232,11 +233,11 @@ class PPORND(PPO):
         given = (values, following, bonus, never, never)
         return generalized_advantages(self.settings.bonus_gamma, self.settings.gae_lambda, *given)
 
+    @override
     def get_extra_state(self) -> NamedValues:
-        """Return the states of both optimisers."""
         return {**super().get_extra_state(), "bonus_optimiser": self.bonus_optimiser.state_dict()}
 
+    @override
     def set_extra_state(self, state: NamedValues) -> None:
-        """Restore what `get_extra_state` returned."""
         super().set_extra_state(state)
         self.bonus_optimiser.load_state_dict(state["bonus_optimiser"])

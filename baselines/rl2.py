@@ -135,8 +135,8 @@ class RL2(PPO):
                 losses[f"success_of_{name}_episodes"] = episodes.mean().item()
         return losses
 
+    @override
     def num_learnt(self, batch: TensorDictBase) -> int:
-        """Return the number of frames without each row's last."""
         return batch[:, :-1].numel()
 
     @torch.no_grad()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from baselines.cells.cell import Cell, CellOutput, CellState, linear_layer, zeros_like_weights
 from baselines.cells.lstm import LSTM
@@ -61,16 +62,17 @@ class AMRL(Cell):
         zeros = (*self.inner.zeros(num_rows), aggregated)
         return zeros if self.is_max else (*zeros, zeros_like_weights(self, num_rows, 1))
 
+    @override
     def step(self, inputs: Tensor, state: CellState) -> CellOutput:
-        """See `Cell`."""
         memory, inner = self.inner.step(inputs, state[:2])
         x, y = memory.chunk(2, dim=-1)
         starts = x.new_zeros(len(x), 1, dtype=torch.bool)
         m, after = self._aggregate(x.unsqueeze(1), starts, state[2:])
         return self._output(m[:, 0], y), (*inner, *after)
 
+    @override
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
-        """See `Cell`; the aggregates are scans."""
+        """The aggregates are scans."""
         memory = self.inner.sequence(inputs, groups, starts, state[:2])
         x, y = memory.chunk(2, dim=-1)
         m, _ = self._aggregate(x, starts, state[2:])

@@ -16,6 +16,7 @@ import math
 
 import torch
 from torch import Tensor, nn
+from typing_extensions import override
 
 from baselines.cells.cell import (
     Cell,
@@ -78,16 +79,17 @@ class Attention(Cell):
         """Return zeros in place of earlier inputs, [num_rows, num_frames - 1, num_inputs + 1], oldest first."""
         return (zeros_like_weights(self, num_rows, self.num_frames - 1, self.num_inputs + 1),)
 
+    @override
     def step(self, inputs: Tensor, state: CellState) -> CellOutput:
-        """See `Cell`."""
         present = torch.cat([inputs, torch.ones_like(inputs[:, :1])], dim=1).unsqueeze(1)
         frames = torch.cat([state[0], present], dim=1)
         seen = frames[..., -1] > 0
         output = self._block(frames[..., :-1], 1, seen.unsqueeze(1))
         return output.squeeze(1), (frames[:, 1:],)
 
+    @override
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
-        """See `Cell`; all steps at once, each over the frames of its episode."""
+        """All steps at once, each over the frames of its episode."""
         present = of_frames(inputs, groups)
         frames = torch.cat([state[0][..., :-1], present], dim=1)
         episode = number_episodes(starts)

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
+from typing_extensions import override
 
 from baselines.cells.cell import Cell, CellOutput, CellState, linear_layer, of_frames, zeros_like_weights
 from baselines.cells.plastic_sequence import Plastic, PlasticSequence, PlasticSteps, columns_times
@@ -79,12 +80,13 @@ class Backpropamine(Cell):
         matrices = [zeros_like_weights(self, num_rows, size, size) for _ in self.state_keys[1:]]
         return (units, *matrices)
 
+    @override
     def step(self, inputs: Tensor, state: CellState) -> CellOutput:
-        """See `Cell`."""
         return self._step(self.input(inputs), state)
 
+    @override
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
-        """See `Cell`; inputs are multiplied with their weights once a group."""
+        """Inputs are multiplied with their weights once a group."""
         given = of_frames(self.input(inputs), groups.T)
         resets = [start.nonzero().squeeze(-1) for start in starts.unbind(1)]
         resets[0] = resets[0][:0]  # zero already

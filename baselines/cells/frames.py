@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from baselines.cells.cell import (
     Cell,
@@ -57,13 +58,14 @@ class Frames(Cell):
         """Return zeros in place of earlier inputs, [num_rows, num_frames - 1, num_inputs], oldest first."""
         return (zeros_like_weights(self, num_rows, self.num_frames - 1, self.num_inputs),)
 
+    @override
     def step(self, inputs: Tensor, state: CellState) -> CellOutput:
-        """See `Cell`."""
         window = torch.cat([state[0], inputs.unsqueeze(1)], dim=1)
         return self.linear(window.flatten(1)).relu(), (window[:, 1:],)
 
+    @override
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
-        """See `Cell`; a frame counts if no episode has started since."""
+        """A frame counts if no episode has started since."""
         frames = torch.cat([state[0], of_frames(inputs, groups)], dim=1)
         episode = number_episodes(starts)
         earlier = episode.new_zeros(len(starts), self.num_frames - 1)

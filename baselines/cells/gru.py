@@ -28,8 +28,8 @@ class GRU(Cell):
         super().__init__(num_features, num_outputs, num_actions, **reads)
         self.gru = nn.GRU(self.num_inputs, num_outputs, batch_first=True, dtype=torch.float32, device="cpu")
 
+    @override
     def step(self, inputs: Tensor, state: CellState) -> CellOutput:
-        """See `Cell`."""
         if is_traced():  # PyTorch's own cannot be vectorised over seeds
             after = gru_step(self.gru, gru_inputs(self.gru, inputs), state[0])
         else:
@@ -37,8 +37,9 @@ class GRU(Cell):
             after = (output.squeeze(1),)
         return after[0], after
 
+    @override
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
-        """See `Cell`; each segment between two resets is a sequence, and the GRU runs over all of them at once."""
+        """Each segment between two resets is a sequence, and the GRU runs over all of them at once."""
         step = partial(gru_step, self.gru)
         return segments(starts).run(step, gru_inputs(self.gru, inputs), groups, state)
 

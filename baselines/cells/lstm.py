@@ -31,14 +31,15 @@ class LSTM(Cell):
         """Return zeros, [num_rows, 1, num_outputs], for both parts of the state."""
         return tuple(zeros_like_weights(self, num_rows, 1, self.num_outputs) for _ in self.state_keys)
 
+    @override
     def step(self, inputs: Tensor, state: CellState) -> CellOutput:
-        """See `Cell`."""
         given = lstm_inputs(self.lstm, inputs)
         h, c = lstm_step(self.lstm, given, state[0].squeeze(1), state[1].squeeze(1))
         return h, (h.unsqueeze(1), c.unsqueeze(1))
 
+    @override
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
-        """See `Cell`; each segment between two resets is a sequence, and the LSTM runs over all of them at once."""
+        """Each segment between two resets is a sequence, and the LSTM runs over all of them at once."""
         if not starts[:, 1:].any():
             output, _ = self.lstm(of_frames(inputs, groups), _layer_first(state))
             return output

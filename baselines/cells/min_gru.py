@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from baselines.cells.cell import Cell, CellOutput, CellState, linear_layer, of_frames
 from baselines.cells.scan import linear_scan
@@ -23,14 +24,15 @@ class MinGRU(Cell):
         self.gate = linear_layer(self.num_inputs, num_outputs)
         self.candidate = linear_layer(self.num_inputs, num_outputs)
 
+    @override
     def step(self, inputs: Tensor, state: CellState) -> CellOutput:
-        """See `Cell`."""
         carry, given = self._parts(inputs)
         output = carry * state[0] + given
         return output, (output,)
 
+    @override
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
-        """See `Cell`; a scan, in which a reset is a carry of 0."""
+        """A scan, in which a reset is a carry of 0."""
         carry, given = self._parts(inputs)
         carry = of_frames(carry, groups)
         given = of_frames(given, groups)

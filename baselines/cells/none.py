@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from torch import Tensor
+from typing_extensions import override
 
 from baselines.cells.cell import Cell, CellOutput, CellState, linear_layer, of_frames
 
@@ -17,10 +18,10 @@ class NoMemory(Cell):
         super().__init__(num_features, num_outputs, num_actions, **reads)
         self.linear = linear_layer(self.num_inputs, num_outputs)
 
+    @override
     def step(self, inputs: Tensor, state: CellState) -> CellOutput:
-        """See `Cell`."""
         return self.linear(inputs).relu(), ()
 
+    @override
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
-        """See `Cell`."""
         return of_frames(self.linear(inputs).relu(), groups)

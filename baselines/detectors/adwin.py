@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from baselines.detectors.detector import Detector
 from baselines.detectors.seen import SUSPICION, Seen, Verdict
@@ -97,8 +98,8 @@ class ADWIN(Detector):
             return self._accepted()
         return SUSPICION if any(self._falls(each) for each in ended) else None
 
+    @override
     def start_label(self, label: int, trial: bool) -> None:
-        """Start with an empty window."""
         self.label = label
         self.is_trial = trial
         self.window = self._new_window()

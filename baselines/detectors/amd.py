@@ -14,6 +14,7 @@ from typing import cast
 import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
+from typing_extensions import override
 
 from baselines.detectors.detector import Detector
 from baselines.detectors.seen import Seen, Verdict
@@ -104,12 +105,8 @@ class AMD(Detector):
         self.is_doubted = False
         """Whether the label did not fit the last batch."""
 
+    @override
     def setup(self, num_rows: int, num_steps: int, num_actions: int, num_observations: int | None) -> None:
-        """See `Detector`.
-
-        Raises:
-            ValueError: for images, and for histories that are too long to be numbered.
-        """
         message = "AMD needs one-hot observations, and these are images: take one-hot tasks, or another detector"
         require((num_observations is not None, message))
         self.num_actions = num_actions
@@ -221,8 +218,8 @@ class AMD(Detector):
         models = {label: (model.keys, model.counts) for label, model in self.models.items()}
         return {**super().state_dict(), "models": models}
 
+    @override
     def load_state_dict(self, state: ReadOnlyValues) -> None:
-        """Restore what `state_dict` returned."""
         super().load_state_dict(state)
         self.models = {label: Counts(*model) for label, model in state["models"].items()}
 

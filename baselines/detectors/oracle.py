@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing_extensions import override
+
 from baselines.detectors.detector import Detector
 from baselines.detectors.seen import Seen, Verdict
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -26,8 +28,8 @@ class Oracle(Detector):
         super().__init__(max_labels, patience=1, snapshot_every=None)
         self.frames = 0
 
+    @override
     def tell(self, curriculum: Curriculum) -> None:
-        """See `Detector`."""
         self.curriculum = curriculum
 
     def present_label(self) -> int:

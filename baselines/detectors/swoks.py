@@ -12,6 +12,7 @@ from typing import cast
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from baselines.detectors.detector import Detector
 from baselines.detectors.seen import SUSPICION, Seen, Verdict
@@ -124,8 +125,8 @@ class SWOKS(Detector):
         self.distances: dict[int, list[float]] = {0: []}
         """The newest distances from the reference of each label, oldest first."""
 
+    @override
     def observe(self, seen: Seen) -> Verdict:
-        """Measure distances and test them after every full window."""
         new = points_of(seen)
         points = torch.cat([self.pending.view(-1, new.shape[1]), new])
         full = len(points) // self.window * self.window

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from typing_extensions import override
 
 from baselines.methods.parts.masks import Masks
 from ctgraph_rl.agent import Agent
@@ -114,10 +115,10 @@ class MaskExchange(Exchange):
         """Return a member's last mean return in a task; 0 where it has none."""
         return self.returns[member].get(task, 0.0)
 
+    @override
     def state_dict(self) -> NamedValues:
-        """Return the returns."""
         return {"returns": [dict(each) for each in self.returns]}
 
+    @override
     def load_state_dict(self, state: ReadOnlyValues) -> None:
-        """Restore what `state_dict` returned."""
         self.returns = [dict(each) for each in state["returns"]]

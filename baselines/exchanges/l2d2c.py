@@ -7,8 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from typing_extensions import override
+
 from baselines.exchanges.exchange import MaskExchange
-from baselines.methods.parts.masks import CombinedMasks, Masks
+from baselines.methods.mask_lc import MaskLC
+from baselines.methods.parts.masks import Masks
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.learn.collective import Help
 from ctgraph_rl.learn.messages import TASK_ID, Array, Fields, Message, Number, to_all
@@ -30,17 +33,17 @@ class L2D2C(MaskExchange):
 
     def takes(self, method: Masks) -> bool:
         """Return whether the mask of a task uses only the scores of that task."""
-        return not isinstance(method, CombinedMasks)
+        return not isinstance(method, MaskLC)
 
+    @override
     def connect(self, agents: Sequence[Agent]) -> None:
-        """See `MaskExchange`."""
         super().connect(agents)
         about: Fields = {"task": TASK_ID, "reward": Number()}
         mask: Fields = {**about, "scores": Array((len(self.methods[0].weights),))}
         self.kinds = {"query": about, "offer": about, "request": {"task": TASK_ID}, "mask": mask}
 
+    @override
     def send(self, kind: str, member: int, received: Sequence[Message]) -> Sequence[Message]:
-        """Send queries, and answer what was received."""
         if kind == "query":
             task = self.task_of(member)
             return to_all(kind, member, self.num_members, self._about(member, task))
@@ -58,8 +61,8 @@ class L2D2C(MaskExchange):
                 answers.append(Message(kind, member, asked.sender, content))
         return answers
 
+    @override
     def receive(self, member: int, received: Sequence[Message]) -> Sequence[Help]:
-        """Replace the scores of the present task."""
         helps = []
         for mask in self._best(member, received):
             task = mask.content["task"]

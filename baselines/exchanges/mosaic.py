@@ -14,6 +14,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import cosine_similarity
+from typing_extensions import override
 
 from baselines.exchanges.exchange import MaskExchange
 from baselines.methods.mask_shared import MaskShared
@@ -103,16 +104,12 @@ class Mosaic(MaskExchange):
         self.use_return = use_return
         self.generator = torch.Generator(device="cpu").manual_seed(seed)
 
+    @override
     def takes(self, method: Masks) -> bool:
-        """Return whether a method combines masks that it receives."""
         return isinstance(method, MaskShared)
 
+    @override
     def connect(self, agents: Sequence[Agent]) -> None:
-        """See `MaskExchange`.
-
-        Raises:
-            ValueError: also if members have no room for so many masks.
-        """
         super().connect(agents)
         room = min(method.max_received for method in self.methods)
         require((self.top_n <= room, f"top_n must be at most method.max_received={room}, got {self.top_n}"))
@@ -170,8 +167,8 @@ class Mosaic(MaskExchange):
         }
         return [Message(kind, member, each.sender, {**_of(each, "task", "similarity"), **own}) for each in received]
 
+    @override
     def receive(self, member: int, received: Sequence[Message]) -> Sequence[Help]:
-        """Combine the masks with the member's own."""
         best = self._best(member, received)
         own = self._own_return(member)
         if not best:
@@ -213,13 +210,13 @@ class Mosaic(MaskExchange):
         newest = {each.sender: each for each in received if each.content["task"] == task}
         return sorted(newest.values(), key=lambda each: (-each.content["similarity"], each.sender))[: self.top_n]
 
+    @override
     def state_dict(self) -> NamedValues:
-        """Return returns, embeddings, transitions and the random stream."""
         known = [dict(vars(each)) for each in self.known]
         return {**super().state_dict(), "known": known, "shape": self.shape, "random": self.generator.get_state()}
 
+    @override
     def load_state_dict(self, state: ReadOnlyValues) -> None:
-        """Restore what `state_dict` returned."""
         super().load_state_dict(state)
         self.known = [KnownMask(**each) for each in state["known"]]
         self._expect(tuple(state["shape"]))

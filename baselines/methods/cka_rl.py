@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
+from typing_extensions import override
 
 from baselines.methods.method import TaskMethod
 from baselines.methods.parts.weights import Weights, flat, head_names, write_flat
@@ -65,8 +66,9 @@ class CKARL(TaskMethod):
         self.alpha_rate = alpha_rate
         self.factor = scale * alpha_rate
 
+    @override
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        """See `Method`; the optimiser now trains w_base + v_k and alpha."""
+        """The optimiser now trains w_base + v_k and alpha."""
         super().setup(agent, weights, curriculum)
         names = weights.names if self.scope == "all" else head_names(agent.policy, without="state_value")
         self.inside = [name in names for name in weights.names]
@@ -142,9 +144,9 @@ class CKARL(TaskMethod):
         of_alpha = self.factor * shares * (along - shares @ along)
         return [*gradients, torch.cat([of_alpha, torch.zeros_like(self.alpha[self.num_combined :])])]
 
+    @override
     @torch.no_grad()
     def after_step(self, weights: Sequence[Tensor]) -> None:
-        """Write w to the network."""
         write_flat(self.current(), self._within(weights))
 
     @torch.no_grad()

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from typing_extensions import override
 
 from baselines.methods.method import Method
 from baselines.methods.parts.weights import Weights
@@ -93,8 +94,8 @@ class CLEAR(Method):
         self.policy_coeff = policy_coeff
         self.value_coeff = value_coeff
 
+    @override
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        """See `Method`."""
         super().setup(agent, weights, curriculum)
         steps = agent.num_steps if agent.memory else 1
         message = f"buffer_size must be at least the {steps} steps of a row, got {self.buffer_size}"
@@ -128,8 +129,8 @@ class CLEAR(Method):
         replay = {("replay", key): value for key, value in replayed.items()}
         return {**batch, **replay}
 
+    @override
     def penalties(self, batch: Data, weights: Sequence[Tensor]) -> TensorsByName:
-        """Compute the cloning losses."""
         replayed = {key[1]: value for key, value in batch.items() if key[0] == "replay"}
         if not replayed:
             return {}
@@ -144,13 +145,13 @@ class CLEAR(Method):
                 losses["loss_value_cloning"] = self.value_coeff * (replayed[key] - now[key]).square().mean()
         return losses
 
+    @override
     def get_extra_state(self) -> NamedValues:
-        """Return the contents of the reservoir."""
         items = {key: value[: len(self.reservoir)].clone() for key, value in self.reservoir.items.items()}
         return {"offered": self.reservoir.offered, "items": items}
 
+    @override
     def set_extra_state(self, state: NamedValues) -> None:
-        """Restore what `get_extra_state` returned."""
         self.reservoir = Reservoir(self.reservoir.capacity)
         self.reservoir.offered = state["offered"]
         for key, value in state["items"].items():

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from baselines.methods.method import Method
 from baselines.methods.parts.weights import Weights, flat, write_flat
@@ -38,24 +39,24 @@ class Finetune(Method):
         self.trunk = trunk
         self.needs_boundaries = trunk == "kept"
 
+    @override
     def attach(self, agent: Agent, curriculum: Curriculum) -> Agent:
-        """Return the agent itself, where its trunk is trained."""
         return super().attach(agent, curriculum) if self.trunk == "kept" else agent
 
+    @override
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        """See `Method`."""
         super().setup(agent, weights, curriculum)
         self.register_buffer("learned", torch.zeros((), dtype=torch.bool, device="cpu"))
         self.register_buffer("kept", weights.zeros())
         self.register_buffer("in_heads", weights.in_heads)
 
+    @override
     def end_task(self) -> None:
-        """Keep the trunk that the first task leaves."""
         if not self.learned:
             self.kept.copy_(self.weights.vector().detach())
             self.learned.fill_(True)
 
+    @override
     @torch.no_grad()
     def after_step(self, weights: Sequence[Tensor]) -> None:
-        """Undo the optimiser's changes of the trunk."""
         write_flat(torch.where(self.in_heads | ~self.learned, flat(weights), self.kept), weights)

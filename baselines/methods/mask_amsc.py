@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from typing_extensions import override
 
 from baselines.methods.parts.selection import STREAM, SelectedMasks, own_generator
 from baselines.methods.parts.weights import Weights
@@ -75,25 +76,25 @@ class MaskAMSC(SelectedMasks):
         self.returns: deque[tuple[float, int]] = deque(maxlen=competence_batches)
         """Sums of the returns of the episodes that ended in the last batches, and their numbers."""
 
+    @override
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        """See `Method`."""
         super().setup(agent, weights, curriculum)
         self.shuffle = own_generator(STREAM + 1)
 
+    @override
     def start_task(self, task: int | None) -> None:
-        """Start with nothing selected and no returns."""
         super().start_task(task)
         self.returns.clear()
 
+    @override
     def on_batch(self, batch: TensorDictBase) -> None:
-        """Keep the transitions and the returns of finished episodes."""
         super().on_batch(batch)
         after = batch["next"]
         ended = after["episode_reward"][after["done"]]
         self.returns.append((float(ended.sum()), ended.numel()))
 
+    @override
     def end_task(self) -> None:
-        """Store the task's scores and its competence."""
         super().end_task()
         found = self._evaluated() if self.episodes == "evaluation" else self._trained()
         self.competence[self.slot] = min(max(found, 0.0), 1.0)
@@ -144,8 +145,8 @@ class MaskAMSC(SelectedMasks):
         own = {"competence": dict(self.competence), "returns": list(self.returns), "shuffle": self.shuffle.get_state()}
         return {**super().get_extra_state(), **own}
 
+    @override
     def set_extra_state(self, state: NamedValues) -> None:
-        """Restore what `get_extra_state` returned."""
         super().set_extra_state(state)
         self.competence = dict(state["competence"])
         self.returns.clear()

@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
-from baselines.methods.parts.masks import CombinedMasks
+from baselines.methods.mask_lc import MaskLC
 
 
-class MaskBLC(CombinedMasks):
-    """`CombinedMasks` with an initial share of 0.5 for the new scores, and equal ones for the earlier tasks."""
+class MaskBLC(MaskLC):
+    """`MaskLC` with an initial share of 0.5 for the new scores, and equal ones for the earlier tasks."""
 
+    @override
     def initial_betas(self, num_earlier: int) -> Tensor:
-        """Return the logarithms of the shares."""
         shares = [0.5 / max(num_earlier, 1)] * num_earlier + [0.5]
         return torch.tensor(shares, dtype=torch.float32, device="cpu").log()

@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
+from typing_extensions import override
 
 from baselines.methods.parts.selection import SelectedMasks
 from baselines.methods.parts.weights import Weights
@@ -54,14 +55,14 @@ class MaskSC(SelectedMasks):
         self.compares = selection == "similarity"
         self.reads_tasks = "the tasks' goals and images" if selection in ORACLES else ""
 
+    @override
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        """See `Method`."""
         super().setup(agent, weights, curriculum)
         if self.selection in ORACLES[1:]:
             ct_graphs(curriculum.tasks, f"selection={self.selection}")
 
+    @override
     def start_task(self, task: int | None) -> None:
-        """Start with what an oracle selects, or nothing."""
         super().start_task(task)
         if self.num_combined and self.selection in ORACLES:
             self.select(self.choose())

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
+from typing_extensions import override
 
 from baselines.methods.parts.masks import Masks, zero_betas
 from baselines.methods.parts.weights import Weights, flat
@@ -42,33 +43,33 @@ class MaskShared(Masks):
         require(*at_least_one(max_received=max_received))
         self.max_received = max_received
 
+    @override
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        """See `Method`."""
         self.num_actions = most_actions(curriculum.tasks)
         self.betas = zero_betas(weights, self.max_received + 1)
         self._keep(torch.zeros(0, len(weights), dtype=torch.float32, device="cpu"))
         super().setup(agent, weights, curriculum)
 
     @property
+    @override
     def trainable(self) -> list[nn.Parameter]:
-        """The own scores and the numbers b."""
         return [*self.own, self.betas]
 
+    @override
     def current_scores(self) -> Sequence[Tensor]:
-        """Compute the combination."""
         if not len(self.received):
             return super().current_scores()
         return self.combine(self.received)
 
+    @override
     @torch.no_grad()
     def start_task(self, task: int | None) -> None:
-        """Start with only the own scores."""
         self._keep(self.received[:0])
         super().start_task(task)
 
+    @override
     @torch.no_grad()
     def end_task(self) -> None:
-        """Store the combination, which the own scores then are."""
         super().end_task()
         self._keep(self.received[:0])
 
@@ -98,11 +99,11 @@ class MaskShared(Masks):
         self.received = torch.cat([scores, scores.new_zeros(excluded, scores.shape[1])]) if excluded else scores
         self.set_places([*range(count), *[0] * excluded, count], excluded, scores.device)
 
+    @override
     def get_extra_state(self) -> NamedValues:
-        """Return what `Masks` does, and the received scores."""
         return {**super().get_extra_state(), "received": self.received[: self.num_received].clone()}
 
+    @override
     def set_extra_state(self, state: NamedValues) -> None:
-        """Restore what `get_extra_state` returned."""
         super().set_extra_state(state)
         self._keep(state["received"].to(self.constant))

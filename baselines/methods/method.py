@@ -14,6 +14,7 @@ from typing import Any, ClassVar, cast
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from typing_extensions import override
 
 from baselines.methods.parts.weights import Weights
 from baselines.parts.hooks import Hooks
@@ -164,13 +165,13 @@ class TaskMethod(Method):
         self.slot = 0
         """The present task's."""
 
+    @override
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        """See `Method`."""
         super().setup(agent, weights, curriculum)
         self.num_tasks = self.num_ids(curriculum)
 
+    @override
     def start_task(self, task: int | None) -> None:
-        """Select the task's slot."""
         name = type(self).__name__
         if task is None:
             raise ValueError(
@@ -206,13 +207,13 @@ class TaskMethod(Method):
         weights[inside.to(weights.device)] = kept[slot]
         return weights
 
+    @override
     def get_extra_state(self) -> NamedValues:
-        """Return the slots of the tasks, and `counts`."""
         counts = {name: getattr(self, name) for name in self.counts}
         return {"begun": list(self.started), "place": self.slot, **counts}
 
+    @override
     def set_extra_state(self, state: NamedValues) -> None:
-        """Restore what `get_extra_state` returned."""
         self.started = list(state["begun"])
         self.slot = state["place"]
         for name in self.counts:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from typing_extensions import override
+
 from baselines.methods.method import Method
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import require
@@ -40,6 +42,6 @@ class Multitask(Method):
         at_once = Block(tasks, curriculum.num_frames, ByEpisode())
         return replace(curriculum, blocks=(at_once,))
 
+    @override
     def attach(self, agent: Agent, curriculum: Curriculum) -> Agent:
-        """Return the agent itself."""
         return agent

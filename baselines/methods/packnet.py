@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from typing_extensions import override
 
 from baselines.methods.method import TaskMethod
 from baselines.methods.parts.heads import Heads
@@ -53,8 +54,8 @@ class PackNet(TaskMethod):
         self.retrain = retrain
         self.heads = Heads()
 
+    @override
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        """See `Method`."""
         super().setup(agent, weights, curriculum)
         self.heads.setup(agent, weights, curriculum)
         self.budgets = [block.num_frames for block in curriculum.blocks]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from torch import Tensor
+from typing_extensions import override
 
 from baselines.methods.method import TaskMethod
 from baselines.methods.parts.weights import Weights
@@ -22,8 +23,8 @@ class Scratch(TaskMethod):
 
     kept: Tensor  # float32 [tasks, P]
 
+    @override
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        """See `Method`."""
         super().setup(agent, weights, curriculum)
         fixed = []
         for name, layer in agent.policy.named_modules():
@@ -44,11 +45,11 @@ class Scratch(TaskMethod):
         self.agent.clear_optimiser_state(self.weights.parameters)
         self.agent.weights_changed()
 
+    @override
     def end_task(self) -> None:
-        """Store the task's network."""
         self.kept[self.slot] = self.weights.vector().detach()
 
+    @override
     def task_weights(self, task: int) -> Tensor | None:
-        """Return the weights of the task's network."""
         slot = self.other_slot(task)
         return None if slot is None else self.kept[slot]

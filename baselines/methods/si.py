@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from baselines.methods.parts.importance import Importance
 from baselines.methods.parts.weights import Weights, flat
@@ -45,15 +46,15 @@ class SI(Importance):
         require(*positive(epsilon=epsilon))
         self.epsilon = epsilon
 
+    @override
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        """See `Method`."""
         super().setup(agent, weights, curriculum)
         for name in ("path", "start", "before", "slope"):
             self.register_buffer(name, weights.zeros())
 
+    @override
     @torch.no_grad()
     def start_task(self, task: int | None) -> None:
-        """Start a new path."""
         super().start_task(task)
         self.path.zero_()
         self.start.copy_(self.weights.vector())
@@ -66,9 +67,9 @@ class SI(Importance):
         self.slope.copy_(flat(gradients) - added)
         return gradients
 
+    @override
     @torch.no_grad()
     def after_step(self, weights: Sequence[Tensor]) -> None:
-        """Add the step to the path."""
         self.path -= self.slope * (flat(weights) - self.before)
 
     def task_importance(self) -> Tensor:

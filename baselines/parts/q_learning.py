@@ -16,6 +16,7 @@ from torchrl.data.postprocs import MultiStep
 from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import EGreedyModule
+from typing_extensions import override
 
 from baselines.parts.learner import MOST_PASSES, Learner
 from baselines.parts.networks import Data, Items, TensorsByName, guided, is_greedy, most_likely, num_actions_of
@@ -223,18 +224,18 @@ class QLearner(Learner):
         self.target_age = 0
         self.optimiser = make_optimiser("adam", greedy.parameters(), self.settings.learning_rate)
 
+    @override
     def start_task(self, task: int | None = None) -> None:
-        """Reset exploration; clear the replay buffer if so configured."""
         self.exploration.eps.copy_(self.exploration.eps_init)
         if self.settings.replay_on_task_change == "clear":
             self.replay.empty()
 
+    @override
     def other_weights(self) -> TensorsByName:
-        """Return the target network's weights."""
         return {f"greedy.{name}": value for name, value in self.target.named_parameters()}
 
+    @override
     def weights_changed(self) -> None:
-        """Copy the weights to the target network."""
         self.target.load_state_dict(self.greedy.state_dict())
         self.target_age = 0
 
@@ -280,8 +281,8 @@ class QLearner(Learner):
             self.weights_changed()
         return measured
 
+    @override
     def after_batch(self, measurements: dict[str, float]) -> dict[str, float]:
-        """Anneal exploration; return the mean measurements with it."""
         self.exploration.step()
         return {**measurements, "exploration": self.exploration.eps.item()}
 
@@ -298,8 +299,8 @@ class QLearner(Learner):
                 items[replay["_storage"]["_len"] :] = 0
         return {**super().get_extra_state(), "replay": replay, "target_age": self.target_age}
 
+    @override
     def set_extra_state(self, state: NamedValues) -> None:
-        """Restore what `get_extra_state` returned."""
         super().set_extra_state(state)
         self.replay.load_state_dict(state["replay"])
         self.target_age = state["target_age"]

@@ -100,8 +100,8 @@ class RecurrentQ(QLearner):
         pairs = given.num_steps * self.num_quantiles**2
         require_replay(observation_spec, given.buffer_size, given.batch_size, pairs)
 
+    @override
     def values(self, data: Data) -> Tensor:
-        """Compute the means of the network's quantiles."""
         return self._head(data)[0]
 
     def quantiles(self, data: Data) -> Tensor:
@@ -112,12 +112,12 @@ class RecurrentQ(QLearner):
         head = self.greedy.module[0].module[1]
         return head.module(self.trunk.over_time(data))
 
+    @override
     def num_items(self, num_steps: int) -> int:
-        """Return the number of sequences."""
         return num_steps // self.num_steps
 
+    @override
     def initial_state(self, num_envs: int) -> TensorDict:
-        """Return zeros for the cell's state."""
         return self.trunk.zero_state(num_envs)
 
     def experience(self, batch: TensorDictBase) -> TensorDictBase:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from typing_extensions import override
 
 from baselines.methods.method import Method
 from baselines.parts.learner import Learner
@@ -128,13 +129,13 @@ class CapturedGroup(SeedGroup):
                 torch.manual_seed(self._words[number])
             yield
 
+    @override
     def start_task(self, task: int | None = None) -> None:
-        """See `ctgraph_rl.agent.Agent`."""
         self._draw_words()
         super().start_task(task)
 
+    @override
     def end_task(self) -> None:
-        """See `ctgraph_rl.agent.Agent`."""
         self._draw_words()
         super().end_task()
 
@@ -150,14 +151,14 @@ class CapturedGroup(SeedGroup):
         for stack in self._stacks:
             stack.read()
 
+    @override
     def policy(self, data: TensorDictBase) -> TensorDictBase:
-        """See `SeedGroup`."""
         return super().policy(data)
 
     policy.capturable = True  # type: ignore[attr-defined]
 
+    @override
     def acted(self, data: TensorDictBase) -> Items:
-        """See `SeedGroup`."""
         keys = self.first.trunk.in_keys
         written = self.stack.one_step({key: self.by_seed(data[key]) for key in keys})
         log_probs = written.pop("log_probs")
@@ -167,15 +168,16 @@ class CapturedGroup(SeedGroup):
             written["next", PREVIOUS_ACTION] = written["action"]
         return written
 
+    @override
     def learn(self, batch: TensorDictBase) -> list[Learnt]:
-        """See `SeedGroup`."""
         measured = super().learn(batch)
         if any(isinstance(each, FloatingPointError) for each in measured):
             self.stack.read()
         return measured
 
+    @override
     def learnt(self, batch: TensorDictBase) -> list[Learnt]:
-        """See `SeedGroup`; the host waits twice."""
+        """The host waits twice."""
         for method, part in zip(self.methods, batch.chunk(len(self.agents)), strict=False):
             method.on_batch(part)
         steps = []

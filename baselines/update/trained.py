@@ -10,6 +10,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.func import functional_call
+from typing_extensions import override
 
 from baselines.parts.hooks import Hooks
 from baselines.parts.networks import Data, TensorsByName
@@ -95,15 +96,15 @@ class Trained(nn.Module):
     def weights_changed(self) -> None:
         """Called after weights were changed other than by learning; nothing else depends on them."""
 
+    @override
     def get_extra_state(self) -> NamedValues:
-        """Return the optimiser's state, so that `state_dict` is complete."""
         saved = self.optimiser.state_dict()
         states = saved["state"].items()  # detached, tensors lack the marks of ``torch.compile``, which are not plain
         saved["state"] = {place: {key: value.detach() for key, value in state.items()} for place, state in states}
         return {"optimiser": saved}
 
+    @override
     def set_extra_state(self, state: NamedValues) -> None:
-        """Restore what `get_extra_state` returned."""
         self.optimiser.load_state_dict(state["optimiser"])
         self.region = None
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from baselines.methods.method import TaskMethod
 from baselines.methods.parts.weights import Weights
@@ -22,8 +23,8 @@ class Heads(TaskMethod):
 
     kept: Tensor  # float32 [tasks, H]
 
+    @override
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        """See `Method`."""
         super().setup(agent, weights, curriculum)
         self.in_heads = weights.in_heads
         message = f"{type(agent).__name__} has no output layers behind a trunk, so tasks cannot have their own"
@@ -41,9 +42,9 @@ class Heads(TaskMethod):
         self.agent.clear_optimiser_state(self.weights.in_head_parameters)
         self.agent.weights_changed()
 
+    @override
     @torch.no_grad()
     def end_task(self) -> None:
-        """Store the task's output layers."""
         self.kept[self.slot] = self.weights.vector()[self.in_heads.to(self.kept.device)]
 
     def slot_of(self, task: int) -> int:
@@ -51,7 +52,7 @@ class Heads(TaskMethod):
         unseen = task not in self.started and len(self.started) < self.num_tasks
         return len(self.started) if unseen else super().slot_of(task)
 
+    @override
     @torch.no_grad()
     def task_weights(self, task: int) -> Tensor | None:
-        """Return the present weights with the task's output layers."""
         return self.present_with(task, self.in_heads, self.kept)

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from typing_extensions import override
 
 from baselines.methods.method import Method, multi_task_blocks
 from baselines.methods.parts.heads import Heads
@@ -50,8 +51,8 @@ class Importance(Method):
         if heads != "single":
             self.agent_members = tuple(dict.fromkeys((*self.agent_members, *Heads.agent_members)))
 
+    @override
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        """See `Method`."""
         super().setup(agent, weights, curriculum)
         self.register_buffer("importance", weights.zeros())
         self.register_buffer("anchor", weights.zeros())
@@ -63,14 +64,14 @@ class Importance(Method):
         in_heads = weights.zeros() if self.heads is None else weights.in_heads.float()
         self.register_buffer("held", 1.0 - in_heads)
 
+    @override
     def start_task(self, task: int | None) -> None:
-        """Load the task's output layers."""
         if self.heads is not None:
             self.heads.start_task(task)
 
+    @override
     @torch.no_grad()
     def end_task(self) -> None:
-        """Compute the importances for the task, and consolidate them."""
         with torch.enable_grad():
             new = self.task_importance()
         self.consolidate(new * self.held, self.weights.vector())
@@ -86,8 +87,8 @@ class Importance(Method):
         self.importance += new
         self.anchor.copy_(weights)
 
+    @override
     def penalties(self, batch: Data, weights: Sequence[Tensor]) -> TensorsByName:
-        """Compute the penalty for distance."""
         gap = flat(weights) - self.anchor
         return {"loss_method": self.coeff * (self.importance * gap.square()).sum()}
 
@@ -186,8 +187,8 @@ class SampledImportance(Importance):
         super().__init__(**settings)
         self.samples = Samples(num_samples)
 
+    @override
     def on_batch(self, batch: TensorDictBase) -> None:
-        """Set how many frames the first pass has."""
         self.samples.remaining = self.agent.num_learnt(batch)
 
     def transform_minibatch(self, batch: Data) -> Data:
@@ -214,10 +215,10 @@ class SampledImportance(Importance):
         """Compute the gradient of a scalar by the weights, [P]; its graph is retained."""
         return flat(torch.autograd.grad(value, self.weights.parameters, retain_graph=True, materialize_grads=True))
 
+    @override
     def get_extra_state(self) -> NamedValues:
-        """Return the samples."""
         return {"samples": self.samples.state()}
 
+    @override
     def set_extra_state(self, state: NamedValues) -> None:
-        """Restore what `get_extra_state` returned."""
         self.samples.restore(state["samples"], self.weights.device)

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
+from typing_extensions import override
 
 from baselines.methods.method import TaskMethod
 from baselines.methods.parts.weights import Weights, flat
@@ -49,8 +50,9 @@ class Masks(TaskMethod):
         require((backbone_seed is None or is_int(backbone_seed, 0, LARGEST_INT), rule))
         self.backbone_seed = backbone_seed
 
+    @override
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        """See `Method`; the optimiser now trains the scores."""
+        """The optimiser now trains the scores."""
         super().setup(agent, weights, curriculum)
         vectors = [name for name, each in weights.named if each.ndim < 2 and "bias" not in name.rpartition(".")[2]]
         rule = f"{type(self).__name__} masks weight matrices, and {', '.join(vectors)} are none"
@@ -121,9 +123,9 @@ class Masks(TaskMethod):
         for own, value in zip(self.own, scores, strict=True):
             own.copy_(value)
 
+    @override
     @torch.no_grad()
     def end_task(self) -> None:
-        """Store the task's scores."""
         present = self.current_scores()
         self.scores[self.slot] = flat(present)
         self.set_scores(present)
@@ -137,16 +139,16 @@ class Masks(TaskMethod):
         of_scores = [c * gradient.reshape(c.shape) for c, gradient in zip(constants, gradients, strict=True)]
         return torch.autograd.grad(scores, self.trainable, of_scores, materialize_grads=True)
 
+    @override
     @torch.no_grad()
     def after_step(self, weights: Sequence[Tensor]) -> None:
-        """Write the masked weights to the network."""
         masked = map(_masked, self.current_scores(), self.weights.split(self.constant))
         for weight, part in zip(weights, masked, strict=True):
             weight.copy_(part.view_as(weight))
 
+    @override
     @torch.no_grad()
     def task_weights(self, task: int) -> Tensor | None:
-        """Return the masked weights of a task."""
         slot = self.other_slot(task)
         return None if slot is None else _masked(self.scores[slot], self.constant)
 
@@ -165,50 +167,6 @@ class Masks(TaskMethod):
 
     def _write(self) -> None:
         self.after_step(self.weights.parameters)
-
-
-class CombinedMasks(Masks):
-    """`Masks` whose new scores are a linear combination of those of earlier tasks and of new ones.
-
-    In the k-th task each weight tensor l has s = sum_i a_i s_i + a_k s_k, where a is the softmax of k trained numbers
-    b_l; the earlier tasks' scores s_i are fixed. At the task's end s is stored as its scores. The numbers b take 4
-    bytes for each task and weight tensor.
-    """
-
-    betas: nn.Parameter  # b, float32 [weight tensors, tasks]; the last one in use is the new scores'
-
-    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        """See `Method`."""
-        self.betas = zero_betas(weights, self.num_ids(curriculum))
-        super().setup(agent, weights, curriculum)
-
-    @property
-    def trainable(self) -> list[nn.Parameter]:
-        """The new scores and the numbers b."""
-        return [*self.own, self.betas]
-
-    @property
-    def num_combined(self) -> int:
-        """Number of earlier tasks in the present combination."""
-        return self.ended if self.slot >= self.ended else 0
-
-    def initial_betas(self, num_earlier: int) -> Tensor:
-        """Return the initial b of the earlier tasks, followed by that of the new scores."""
-        raise NotImplementedError
-
-    def init_scores(self) -> None:
-        """Initialise a new task's scores and its combination."""
-        super().init_scores()
-        self.betas.zero_()
-        self.betas[:, : self.slot + 1] = self.initial_betas(self.slot)
-
-    def current_scores(self) -> Sequence[Tensor]:
-        """Compute the combination."""
-        earlier = self.num_combined
-        if not earlier:
-            return super().current_scores()
-        old = self.weights.split(self.scores[..., :earlier, :])
-        return list(map(combined, self.betas[..., : earlier + 1].unbind(-2), old, self.own))
 
 
 def zero_betas(weights: Weights, count: int) -> nn.Parameter:

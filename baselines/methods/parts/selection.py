@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import normalize
+from typing_extensions import override
 
 from baselines.methods.mask_lc import MaskLC
 from baselines.methods.parts.weights import Weights
@@ -158,8 +159,8 @@ class SelectedMasks(MaskLC):
         self.num_batches = 0
         """Of the present task."""
 
+    @override
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        """See `Method`."""
         super().setup(agent, weights, curriculum)
         self.generator = own_generator()
         self.curriculum = curriculum
@@ -176,25 +177,25 @@ class SelectedMasks(MaskLC):
         """Return the slots of the tasks to select, among the first `num_combined`."""
         raise NotImplementedError
 
+    @override
     def start_task(self, task: int | None) -> None:
-        """Start with nothing selected."""
         super().start_task(task)
         self.num_batches = 0
         self.embeddings.start_task()
 
+    @override
     def init_scores(self) -> None:
-        """Initialise a new task's scores and its combination."""
         super().init_scores()
         self._gather([])
 
+    @override
     def on_batch(self, batch: TensorDictBase) -> None:
-        """Keep the transitions."""
         if self.compares:
             self.embeddings.see(batch)
 
+    @override
     @torch.no_grad()
     def after_learning(self) -> None:
-        """Embed the task, and select where it is time."""
         if self.compares:
             self.embeddings.update(self.slot, self.num_actions, self.generator)
         self.num_batches += 1
@@ -209,8 +210,8 @@ class SelectedMasks(MaskLC):
             self._write()
             self.agent.weights_changed()
 
+    @override
     def current_scores(self) -> Sequence[Tensor]:
-        """Compute the combination."""
         if not self.num_combined:
             return list(self.own)
         return self.combine(self.community)
@@ -231,8 +232,8 @@ class SelectedMasks(MaskLC):
         counts = {"selected": self.selected, "num_batches": self.num_batches, "random": self.generator.get_state()}
         return {**super().get_extra_state(), **counts, "embeddings": self.embeddings.state()}
 
+    @override
     def set_extra_state(self, state: NamedValues) -> None:
-        """Restore what `get_extra_state` returned."""
         super().set_extra_state(state)
         self.num_batches = state["num_batches"]
         self.generator.set_state(state["random"].cpu())

@@ -14,9 +14,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from typing_extensions import override
 
 from baselines.detectors.seen import SUSPICION, Seen
-from baselines.methods.method import AgentWithMethod, multi_task_blocks
+from baselines.methods.method import multi_task_blocks
 from baselines.parts.networks import sequences_of, trunk_of
 from ctgraph_rl.agent import Agent, MethodLike
 from ctgraph_rl.checks import NamedValues, require
@@ -177,7 +178,7 @@ class SelfLabelledAgent(nn.Module):
     @property
     def unwrapped(self) -> Agent:
         """The agent without detector and method."""
-        return self.learner.agent if isinstance(self.learner, AgentWithMethod) else self.learner
+        return getattr(self.learner, "unwrapped", self.learner)
 
     def policy_for(self, task: int) -> TensorDictModuleBase:
         """Return the policy for a label."""
@@ -313,14 +314,14 @@ class SelfLabelledAgent(nn.Module):
             self.learner.start_task(label)
         self._resume(label)
 
+    @override
     def get_extra_state(self) -> NamedValues:
-        """Return the labels, the snapshots and the detector's state."""
         own = {name: getattr(self, name) for name in STATE}
         snapshots = [{**each, "state": dict(each["state"])} for each in self.snapshots]
         return {**own, "waiting": list(self.waiting), "snapshots": snapshots, "detector": self.detector.state_dict()}
 
+    @override
     def set_extra_state(self, state: NamedValues) -> None:
-        """Restore what `get_extra_state` returned."""
         for name in STATE:
             setattr(self, name, state[name])
         self.waiting = list(state["waiting"])
