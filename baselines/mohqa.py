@@ -57,147 +57,6 @@ RMSPROP_EPS = 0.01
 """As published."""
 
 
-class Projected(nn.Module):
-    """An encoder with a linear layer behind it.
-
-    Args:
-        encoder: of observations.
-        num_inputs: width of its features.
-        num_features: outputs.
-    """
-
-    def __init__(self, encoder: nn.Module, num_inputs: int, num_features: int) -> None:
-        super().__init__()
-        self.encoder = encoder
-        self.linear = linear_layer(num_inputs, num_features)
-
-    def forward(self, *inputs: Tensor) -> Tensor:
-        """Map the encoder's inputs to float32 [..., num_features]."""
-        return self.linear(self.encoder(*inputs))
-
-
-class HebbianHead(nn.Module):
-    """The weights W_h and how eligibility and weights change.
-
-    Args:
-        num_features: width of phi.
-        num_actions: rows of W_h.
-        eligibility_steps: tau, in steps.
-        hebbian_share: share of the features, rounded up, with the largest y, and with the smallest.
-        hebbian_change: c.
-        hebbian_decay: h.
-        reward_baseline: b.
-    """
-
-    weights: Tensor
-
-    def __init__(
-        self,
-        num_features: int,
-        num_actions: int,
-        eligibility_steps: float,
-        hebbian_share: float,
-        hebbian_change: float,
-        hebbian_decay: float,
-        reward_baseline: float,
-    ) -> None:
-        super().__init__()
-        self.decay = math.exp(-1 / eligibility_steps)
-        self.share = hebbian_share
-        self.change = hebbian_change
-        self.fall = hebbian_decay
-        self.reward_baseline = reward_baseline
-        self.register_buffer("weights", torch.zeros(num_actions, num_features, dtype=torch.float32, device="cpu"))
-
-    def forward(self, y: Tensor) -> Tensor:
-        """Compute u, [..., num_actions], from y, [..., num_features]."""
-        return nn.functional.linear(y, self.weights).sigmoid()
-
-    def eligibility(self, before: Tensor, y: Tensor, action: Tensor) -> Tensor:
-        """Return the eligibility after an action, [n, num_actions, num_features]; y is [n, num_features]."""
-        number = (self.share * y.count_nonzero(dim=-1).to(y.dtype)).ceil().unsqueeze(-1)
-        place = y.argsort(dim=-1).argsort(dim=-1)
-        largest = place >= y.shape[-1] - number
-        smallest = place < number
-        others = ~(largest | smallest)
-        row = self.change * (largest.to(y.dtype) - smallest.to(y.dtype)) - self.fall * others.to(y.dtype)
-        taken = one_hot(action, len(self.weights)).unsqueeze(-1)
-        return self.decay * before + taken * row.unsqueeze(-2)
-
-    def modulate(self, eligibility: Tensor, reward: Tensor) -> None:
-        """Change the weights step by step.
-
-        Args:
-            eligibility: after each step, [num_envs, num_steps, num_actions, num_features].
-            reward: of each step, [num_envs, num_steps, 1].
-        """
-        modulation = (reward.sign() - self.reward_baseline).unsqueeze(-1)
-        for change in (modulation * eligibility).sum(dim=0):
-            self.weights.add_(change).clamp_(-1, 1)
-
-
-class ModulatedGreedy(TensorDictModuleBase):
-    """The policy: greedy on q + u, with exploration; it writes eligibility and average.
-
-    Args:
-        trunk: computes phi.
-        head: computes q, an ``nn.Module`` in a TensorDictModule.
-        hebbian: computes u.
-        exploration: replaces some actions by random ones.
-        average_decay: d.
-        noise_std: standard deviation of the noise, which only an exploring policy has.
-        noise_share: probability of a feature to get noise.
-    """
-
-    def __init__(
-        self,
-        trunk: EncoderModule,
-        head: TensorDictModule,
-        hebbian: HebbianHead,
-        exploration: EGreedyModule,
-        *,
-        average_decay: float,
-        noise_std: float,
-        noise_share: float,
-    ) -> None:
-        super().__init__()
-        self.greedy = TensorDictSequential(trunk, head)
-        self.hebbian = hebbian
-        self.exploration = exploration
-        self.average_decay = average_decay
-        self.noise_std = noise_std
-        self.noise_share = noise_share
-        self.in_keys = [*trunk.in_keys, "is_init", *STATE]
-        self.out_keys = ["action", *(("next", key) for key in STATE)]
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action`` and the next state."""
-        features = self.features(tensordict)
-        average = tensordict["average"]
-        y = (features + self._noise(features) - average).tanh()
-        tensordict.set("action", (self.head(features) + self.hebbian(y)).argmax(dim=-1))
-        tensordict = self.exploration(tensordict)
-        tensordict.set("action", guided(tensordict, tensordict["action"]))
-        before = tensordict["eligibility"] * ~tensordict["is_init"].unsqueeze(-1)
-        after = self.hebbian.eligibility(before, y, tensordict["action"])
-        tensordict.set(("next", "eligibility"), after)
-        tensordict.set(("next", "average"), average.lerp(features, 1 - self.average_decay))
-        return tensordict.set(("next", "trial"), tensordict["trial"])
-
-    def features(self, data: Data) -> Tensor:
-        """Compute phi at any number of steps, [..., num_features]."""
-        return self.greedy[0].over_time(data)
-
-    def head(self, features: Tensor) -> Tensor:
-        """Compute q, [..., num_actions]."""
-        return self.greedy[1].module(features)
-
-    def _noise(self, features: Tensor) -> Tensor:
-        if is_greedy():
-            return torch.zeros_like(features)
-        return self.noise_std * torch.randn_like(features) * (torch.rand_like(features) < self.noise_share)
-
-
 @dataclass(frozen=True, kw_only=True)
 class MOHQASettings(QLearnerSettings):
     """The settings of `MOHQA`."""
@@ -227,6 +86,124 @@ class MOHQASettings(QLearnerSettings):
         )
 
 
+class Projected(nn.Module):
+    """An encoder with a linear layer behind it.
+
+    Args:
+        encoder: of observations.
+        num_inputs: width of its features.
+        num_features: outputs.
+    """
+
+    def __init__(self, encoder: nn.Module, num_inputs: int, num_features: int) -> None:
+        super().__init__()
+        self.encoder = encoder
+        self.linear = linear_layer(num_inputs, num_features)
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Map the encoder's inputs to float32 [..., num_features]."""
+        return self.linear(self.encoder(*inputs))
+
+
+class HebbianHead(nn.Module):
+    """The weights W_h and how eligibility and weights change.
+
+    Args:
+        settings: of the agent.
+        num_actions: rows of W_h.
+    """
+
+    weights: Tensor
+
+    def __init__(self, settings: MOHQASettings, num_actions: int) -> None:
+        super().__init__()
+        self.settings = settings
+        self.decay = math.exp(-1 / settings.eligibility_steps)
+        weights = torch.zeros(num_actions, settings.num_features, dtype=torch.float32, device="cpu")
+        self.register_buffer("weights", weights)
+
+    def forward(self, y: Tensor) -> Tensor:
+        """Compute u, [..., num_actions], from y, [..., num_features]."""
+        return nn.functional.linear(y, self.weights).sigmoid()
+
+    def eligibility(self, before: Tensor, y: Tensor, action: Tensor) -> Tensor:
+        """Return the eligibility after an action, [n, num_actions, num_features]; y is [n, num_features]."""
+        number = (self.settings.hebbian_share * y.count_nonzero(dim=-1).to(y.dtype)).ceil().unsqueeze(-1)
+        place = y.argsort(dim=-1).argsort(dim=-1)
+        largest = place >= y.shape[-1] - number
+        smallest = place < number
+        others = ~(largest | smallest)
+        rise = self.settings.hebbian_change * (largest.to(y.dtype) - smallest.to(y.dtype))
+        row = rise - self.settings.hebbian_decay * others.to(y.dtype)
+        taken = one_hot(action, len(self.weights)).unsqueeze(-1)
+        return self.decay * before + taken * row.unsqueeze(-2)
+
+    def modulate(self, eligibility: Tensor, reward: Tensor) -> None:
+        """Change the weights step by step.
+
+        Args:
+            eligibility: after each step, [num_envs, num_steps, num_actions, num_features].
+            reward: of each step, [num_envs, num_steps, 1].
+        """
+        modulation = (reward.sign() - self.settings.reward_baseline).unsqueeze(-1)
+        for change in (modulation * eligibility).sum(dim=0):
+            self.weights.add_(change).clamp_(-1, 1)
+
+
+class ModulatedGreedy(TensorDictModuleBase):
+    """The policy: greedy on q + u, with exploration; it writes eligibility and average.
+
+    Args:
+        trunk: computes phi.
+        head: computes q, an ``nn.Module`` in a TensorDictModule.
+        hebbian: computes u.
+        exploration: replaces some actions by random ones.
+        settings: of the agent.
+    """
+
+    def __init__(
+        self,
+        trunk: EncoderModule,
+        head: TensorDictModule,
+        hebbian: HebbianHead,
+        exploration: EGreedyModule,
+        settings: MOHQASettings,
+    ) -> None:
+        super().__init__()
+        self.greedy = TensorDictSequential(trunk, head)
+        self.hebbian = hebbian
+        self.exploration = exploration
+        self.settings = settings
+        self.in_keys = [*trunk.in_keys, "is_init", *STATE]
+        self.out_keys = ["action", *(("next", key) for key in STATE)]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action`` and the next state."""
+        features = self.features(tensordict)
+        average = tensordict["average"]
+        noisy = features
+        if not is_greedy():
+            noise = self.settings.noise_std * torch.randn_like(features)
+            noisy = features + noise * (torch.rand_like(features) < self.settings.noise_share)
+        y = (noisy - average).tanh()
+        tensordict.set("action", (self.head(features) + self.hebbian(y)).argmax(dim=-1))
+        tensordict = self.exploration(tensordict)
+        tensordict.set("action", guided(tensordict, tensordict["action"]))
+        before = tensordict["eligibility"] * ~tensordict["is_init"].unsqueeze(-1)
+        after = self.hebbian.eligibility(before, y, tensordict["action"])
+        tensordict.set(("next", "eligibility"), after)
+        tensordict.set(("next", "average"), average.lerp(features, 1 - self.settings.average_decay))
+        return tensordict.set(("next", "trial"), tensordict["trial"])
+
+    def features(self, data: Data) -> Tensor:
+        """Compute phi at any number of steps, [..., num_features]."""
+        return self.greedy[0].over_time(data)
+
+    def head(self, features: Tensor) -> Tensor:
+        """Compute q, [..., num_actions]."""
+        return self.greedy[1].module(features)
+
+
 class MOHQA(QLearner):
     """A Q-network with a modulated Hebbian network beside it; its settings are `MOHQASettings`."""
 
@@ -246,28 +223,12 @@ class MOHQA(QLearner):
         trunk = EncoderModule(projected, in_keys=inner.in_keys, out_keys=["features"])
         layers = nn.Sequential(nn.ReLU(), linear_layer(given.num_features, num_actions), nn.Sigmoid())
         head = TensorDictModule(layers, in_keys=["features"], out_keys=["action_value"])
-        self.hebbian = HebbianHead(
-            given.num_features,
-            num_actions,
-            eligibility_steps=given.eligibility_steps,
-            hebbian_share=given.hebbian_share,
-            hebbian_change=given.hebbian_change,
-            hebbian_decay=given.hebbian_decay,
-            reward_baseline=given.reward_baseline,
-        )
+        self.hebbian = HebbianHead(given, num_actions)
         self.register_buffer("target_weights", self.hebbian.weights.clone())
         self.register_buffer("average", torch.zeros(given.num_features, dtype=torch.float32, device="cpu"))
         network = TensorDictSequential(trunk, head)
         self.set_networks(network, action_spec)
-        self.policy = ModulatedGreedy(
-            trunk,
-            head,
-            self.hebbian,
-            self.exploration,
-            average_decay=given.average_decay,
-            noise_std=given.noise_std,
-            noise_share=given.noise_share,
-        )
+        self.policy = ModulatedGreedy(trunk, head, self.hebbian, self.exploration, given)
         rate = given.learning_rate
         self.optimiser = torch.optim.RMSprop(network.parameters(), rate, alpha=RMSPROP_ALPHA, eps=RMSPROP_EPS)
 

@@ -180,8 +180,6 @@ class PEARL(Learner):
     the policy's must not reach the encoder, and it keeps its critics where a `Learner` does not find their weights.
 
     Args:
-        observation_spec: the environment's ``observation_spec_unbatched``.
-        action_spec: the environment's ``action_spec_unbatched``.
         settings: the fields of `PEARLSettings`.
     """
 

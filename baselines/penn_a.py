@@ -127,15 +127,16 @@ def live(lives: Population, inputs: Tensor, weights: Tensor, outputs: Tensor) ->
     return changing.movedim(-1, 0), outputs.T
 
 
-class Reproduction(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Reproduction:
     """How a generation follows from the one before."""
 
-    segment_size: int
-    crossover_prob: float
-    insert_prob: float
-    duplicate_prob: float
-    delete_prob: float
-    precision: float
+    segment_size: int  # individuals of which the best one has all children
+    crossover_prob: float  # probability of a child to be crossed with a random individual
+    insert_prob: float  # probability of a child to get a new neuron
+    duplicate_prob: float  # probability of a child to get a copy of a neuron
+    delete_prob: float  # probability of a child to lose a neuron
+    precision: float  # of mutations, see `mutation`
 
     def children(self, parents: Population, fitness: Tensor) -> Population:
         """Return the next generation; its first individual is the best of this one, unchanged."""
@@ -299,8 +300,8 @@ class Autoencoder(nn.Module):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PennASettings:
-    """The settings of `PennA`."""
+class PennASettings(Reproduction):
+    """The settings of `PennA`, with those of `Reproduction`."""
 
     num_envs: int  # rows, num_trials for each individual
     num_steps: int  # steps of each row in a batch
@@ -312,12 +313,6 @@ class PennASettings:
     learning_rate: float  # of its gradient steps, which have momentum as published, not Adam
     num_updates: int  # gradient steps after a generation
     batch_size: int  # observations of each
-    segment_size: int  # individuals of which the best one has all children
-    crossover_prob: float  # probability of a child to be crossed with a random individual
-    insert_prob: float  # probability of a child to get a new neuron
-    duplicate_prob: float  # probability of a child to get a copy of a neuron
-    delete_prob: float  # probability of a child to lose a neuron
-    precision: float  # of mutations, see `mutation`
 
     def __post_init__(self) -> None:
         make_fields_plain(self)
@@ -338,8 +333,6 @@ class PennA(TensorDictModuleBase):
     """A population that evolves. It is its own policy: each row has weights that last over the episodes of a life.
 
     Args:
-        observation_spec: the environment's ``observation_spec_unbatched``.
-        action_spec: the environment's ``action_spec_unbatched``.
         settings: the fields of `PennASettings`.
     """
 
@@ -359,14 +352,6 @@ class PennA(TensorDictModuleBase):
         weights = given.num_envs * (given.num_latents + len(NEURONS)) * len(NEURONS)
         what = f"weights of num_envs={given.num_envs} with num_latents={given.num_latents}"
         require_memory(what, 16 * weights, "of either")
-        self.reproduction = Reproduction(
-            segment_size=given.segment_size,
-            crossover_prob=given.crossover_prob,
-            insert_prob=given.insert_prob,
-            duplicate_prob=given.duplicate_prob,
-            delete_prob=given.delete_prob,
-            precision=given.precision,
-        )
         self.num_envs = given.num_envs
         self.num_steps = given.num_steps
         shown = observation_spec["observation"]
@@ -444,7 +429,7 @@ class PennA(TensorDictModuleBase):
             "neurons_mean": self.population.size.double().mean().item(),
             "loss_autoencoder": self._learn_latents(batch["observation"].flatten(0, 1)),
         }
-        self.population = self.reproduction.children(self.population, fitness)
+        self.population = self.settings.children(self.population, fitness)
         self.generation += 1
         self.lived = 0
         self.rewards.zero_()

@@ -22,13 +22,10 @@ class AMRL(Cell):
     """Aggregated memory behind an LSTM.
 
     Args:
-        num_features: width of the features.
         num_outputs: width of the LSTM and of what is written; even.
-        num_actions: actions of the task.
         aggregator: ``max`` or ``mean``. The mean divides by the number of steps since the start, which nothing reads.
         straight_through: the gradient of the aggregate by each input is 1, as in the paper, whose author later found
             that it can explode (Beck et al. 2024, arXiv 2403.03020); False: that of the maximum or the mean.
-        reads: see `Cell`.
     """
 
     holds = "whether something was seen in an episode, for any time; and what its LSTM holds"

@@ -37,15 +37,9 @@ class Attention(Cell):
     The state holds the inputs of these steps, each with a 1, and zeros for steps before the episode.
 
     Args:
-        num_features: width of the features.
         num_outputs: width of what it writes; a multiple of ``num_heads``.
-        num_actions: actions of the task.
         num_frames: steps that it attends to, the present one among them.
         num_heads: heads of attention.
-        reads: see `Cell`.
-
-    Raises:
-        ValueError: for values out of range.
     """
 
     state_keys = ("recurrent_state_frames",)

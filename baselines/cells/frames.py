@@ -39,11 +39,7 @@ class Frames(Cell):
     """A linear layer with ReLU over the inputs of the last steps; zeros stand for those before the episode.
 
     Args:
-        num_features: width of the features.
-        num_outputs: width of what it writes.
-        num_actions: actions of the task.
         num_frames: steps that it reads, the present one among them.
-        reads: see `Cell`.
     """
 
     state_keys = ("recurrent_state_frames",)

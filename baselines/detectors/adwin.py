@@ -45,7 +45,7 @@ class ADWIN(Detector):
         min_window_length: episodes of a part.
         grace_period: episodes before the first look.
         num_trial_episodes: before a label is accepted.
-        max_labels: as the following, of `Detector`.
+        settings: the arguments of `Detector`.
 
     Raises:
         ModuleNotFoundError: without River; names the extra to install.
@@ -61,11 +61,9 @@ class ADWIN(Detector):
         min_window_length: int,
         grace_period: int,
         num_trial_episodes: int,
-        max_labels: int,
-        patience: int,
-        snapshot_every: int,
+        **settings: Any,
     ) -> None:
-        super().__init__(max_labels, patience, snapshot_every)
+        super().__init__(**settings)
         require(
             (is_real(delta, 0, 1) and 0 < delta < 1, f"delta must be in (0, 1), got {delta!r}"),
             *at_least_one(clock=clock, max_buckets=max_buckets, min_window_length=min_window_length),

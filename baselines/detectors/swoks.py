@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -50,7 +50,7 @@ class SWOKS(Detector):
         stable_phase: points after the start of a label without a test.
         num_fresh: distances that are measured in a trial before its first test; with fewer than ``num_tested``, a label
             may be accepted for steps that were taken before its trial.
-        max_labels: as the following, of `Detector`.
+        settings: the arguments of `Detector`.
     """
 
     reads = "features, rewards"
@@ -70,11 +70,9 @@ class SWOKS(Detector):
         adjustment: float,
         stable_phase: int,
         num_fresh: int,
-        max_labels: int,
-        patience: int,
-        snapshot_every: int,
+        **settings: Any,
     ) -> None:
-        super().__init__(max_labels, patience, snapshot_every)
+        super().__init__(**settings)
         require(
             *at_least_one(window=window, num_windows=num_windows, num_directions=num_directions),
             *at_least_one(num_tested=num_tested, num_kept=num_kept, num_left_out=num_left_out),
@@ -87,9 +85,9 @@ class SWOKS(Detector):
             ),
             (is_int(stable_phase, 0), f"stable_phase must be an integer >= 0, got {stable_phase!r}"),
             (
-                is_int(num_fresh, 0) and num_fresh * window <= patience,
-                f"num_fresh must be an integer in 0..{patience // window}, the windows in patience={patience} points, "
-                f"got {num_fresh!r}",
+                is_int(num_fresh, 0) and num_fresh * window <= self.patience,
+                f"num_fresh must be an integer in 0..{self.patience // window}, the windows in "
+                f"patience={self.patience} points, got {num_fresh!r}",
             ),
             *fraction(alpha=alpha, accept=accept),
             *positive(adjustment=adjustment),

@@ -25,9 +25,6 @@ class Exchange(TakesNumbers):
         every: batches between two exchanges; the first is after the first batch.
         drop_prob: probability that a message is lost.
         delay_prob: probability that a message which is not lost arrives at the next exchange.
-
-    Raises:
-        ValueError: for values out of range.
     """
 
     def __init__(self, num_members: int, every: int, drop_prob: float, delay_prob: float) -> None:

@@ -57,7 +57,8 @@ class L2D2C(MaskExchange):
             if kind == "mask" and task in self.returns[member]:
                 scores = self.methods[member].scores_of(task)
                 answers.append(Message(kind, member, asked.sender, {**content, "scores": scores}))
-            if kind == "offer" and self._is_better(member, asked):
+            own = self.return_of(member, task)
+            if kind == "offer" and own > 0 and _is_wanted(own, asked.content["reward"]):
                 answers.append(Message(kind, member, asked.sender, content))
         return answers
 
@@ -71,11 +72,6 @@ class L2D2C(MaskExchange):
             values = {"task_id": task, "return_of_sender": reward, "return_before": self.return_of(member, task)}
             helps.append(Help(mask.sender, member, values))
         return helps
-
-    def _is_better(self, member: int, query: Message) -> bool:
-        """Return whether a member's mask is worth an offer."""
-        own = self.return_of(member, query.content["task"])
-        return own > 0 and _is_wanted(own, query.content["reward"])
 
     def _about(self, member: int, task: int) -> dict[str, object]:
         """Return what a member says of a task."""

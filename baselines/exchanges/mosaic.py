@@ -65,9 +65,6 @@ class Mosaic(MaskExchange):
         own_share: fixed initial share of the own scores, in (0, 1); None: by the return.
         seed: decides the samples.
         common: arguments of `Exchange`.
-
-    Raises:
-        ValueError: for values out of range.
     """
 
     method = "mask_shared"

@@ -306,8 +306,6 @@ class InnerLoop(Learner):
     """A policy that adapts within a trial; a class that derives from it says which weights do.
 
     Args:
-        observation_spec: the environment's ``observation_spec_unbatched``.
-        action_spec: the environment's ``action_spec_unbatched``.
         settings: the fields of the class's `Settings`.
     """
 

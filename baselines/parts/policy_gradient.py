@@ -90,8 +90,6 @@ class PolicyGradient(Learner):
     state is reset wherever ``is_init`` is set, and minibatches are whole rows, so it sees sequences in order.
 
     Args:
-        observation_spec: the environment's ``observation_spec_unbatched``.
-        action_spec: the environment's ``action_spec_unbatched``.
         settings: the fields of the class's `Settings`.
     """
 

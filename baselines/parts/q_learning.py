@@ -162,8 +162,6 @@ class QLearner(Learner):
     that takes ``others`` gets the target network's weights, for `with_others`.
 
     Args:
-        observation_spec: the environment's ``observation_spec_unbatched``.
-        action_spec: the environment's ``action_spec_unbatched``.
         settings: the fields of the class's `Settings`.
     """
 

@@ -68,8 +68,6 @@ class RecurrentQ(QLearner):
     """Q-learning with a cell; classes that derive from it define the distance of predictions from targets.
 
     Args:
-        observation_spec: the environment's ``observation_spec_unbatched``.
-        action_spec: the environment's ``action_spec_unbatched``.
         settings: the fields of the class's `Settings`.
     """
 

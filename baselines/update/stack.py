@@ -120,7 +120,7 @@ class Stack:
 
     def one_step(self, data: Items) -> Items:
         """Compute `Learner.one_step` of all learners, [seeds, num_envs, ...] each."""
-        return over_seeds(self.learners[0], _one_step, self.state, data)
+        return over_seeds(self.learners[0], lambda learner, weights, data: learner.one_step(data), self.state, data)
 
     def acting_inputs(self, data: Items) -> list[Tensor]:
         """Return the tensors that `outputs` reads, in one order."""
@@ -148,7 +148,3 @@ def _keep(kept: TensorsByName, name: str, value: Tensor) -> None:
 
 def _outputs(learner: Learner, weights: Sequence[Tensor], data: Data) -> TensorsByName:
     return learner.outputs(data)
-
-
-def _one_step(learner: Learner, weights: Sequence[Tensor], data: Data) -> Items:
-    return learner.one_step(data)

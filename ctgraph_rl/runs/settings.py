@@ -135,7 +135,7 @@ def with_added(settings: ReadOnlyValues) -> NamedValues:
 def parameters_of(function: Any) -> dict[str, Parameter]:
     """Return the arguments of a function or class by name.
 
-    Those that a class takes as ``**`` are the fields of its ``Settings``, a dataclass, or else its base's arguments.
+    Those that a class takes as ``**`` are those of its ``Settings``, mostly a dataclass, or else of its base.
     """
     own = signature(function).parameters
     stars = (Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD)
@@ -143,7 +143,7 @@ def parameters_of(function: Any) -> dict[str, Parameter]:
     hands_on = isinstance(function, type) and stars[1] in {parameter.kind for parameter in own.values()}
     if not hands_on:
         return named
-    return parameters_of(getattr(function, "Settings", function.__mro__[1])) | named
+    return parameters_of(vars(function).get("Settings", function.__mro__[1])) | named
 
 
 def check_arguments(group: str, given: Sequence[str], function: Any) -> None:

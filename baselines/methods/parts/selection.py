@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -21,7 +22,7 @@ from baselines.parts.embedding import (
     with_last,
 )
 from baselines.parts.learner import Learner
-from ctgraph_rl.checks import NamedValues, at_least_one, one_of, require
+from ctgraph_rl.checks import NamedValues, TakesNumbers, at_least_one, one_of, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.task_like import TaskLike, most_actions
 
@@ -36,7 +37,7 @@ def own_generator(stream: int = STREAM) -> torch.Generator:
     return torch.Generator(device="cpu").manual_seed((torch.initial_seed() ^ stream << 32) % 2**63)
 
 
-class TaskEmbeddings:
+class TaskEmbeddings(TakesNumbers):
     """A moving average of the embeddings of samples for each task, by slot.
 
     After each batch ``num_samples`` of the last ``buffer_size`` transitions of the present task are drawn without
@@ -122,9 +123,10 @@ class SelectedMasks(MaskLC):
 
     Args:
         every: batches between two selections.
-        embedding: as the following, of `TaskEmbeddings`.
+        embedding: the arguments of `TaskEmbeddings`.
     """
 
+    Settings = TaskEmbeddings
     stackable = False
 
     compares = True
@@ -132,27 +134,11 @@ class SelectedMasks(MaskLC):
 
     community: Tensor  # scores of the selected tasks, and of others with a share of 0, float32 [n, P]
 
-    def __init__(
-        self,
-        every: int,
-        embedding: str,
-        num_samples: int,
-        buffer_size: int,
-        num_references: int,
-        num_directions: int,
-        num_quantiles: int,
-    ) -> None:
+    def __init__(self, every: int, **embedding: Any) -> None:
         super().__init__()
         require(*at_least_one(every=every))
         self.every = every
-        self.embeddings = TaskEmbeddings(
-            embedding,
-            num_samples,
-            buffer_size,
-            num_references=num_references,
-            num_directions=num_directions,
-            num_quantiles=num_quantiles,
-        )
+        self.embeddings = TaskEmbeddings(**embedding)
         self.selected: list[int] = []
         """The slots of the selected tasks."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from copy import deepcopy
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -25,15 +26,15 @@ THETA = [[0.0, -0.3, 0.0, 0.3, 0.0, 0.0], [0.0, 0.0, -0.3, 0.0, 0.3, 0.0]]
 
 
 def head(num_actions: int = 3, num_features: int = 6) -> HebbianHead:
-    return HebbianHead(
-        num_features,
-        num_actions,
+    settings = SimpleNamespace(
+        num_features=num_features,
         eligibility_steps=48,
         hebbian_share=0.13,
         hebbian_change=0.3,
         hebbian_decay=0.005,
         reward_baseline=0.001,
     )
+    return HebbianHead(settings, num_actions)
 
 
 def theta(action: int, row: list[float]) -> torch.Tensor:

@@ -57,7 +57,9 @@ SETTINGS = {
 STILL = {"learning_rate": 1e-7, "num_updates": 1}
 """The autoencoder hardly changes."""
 
-NOTHING = Reproduction(5, crossover_prob=0, insert_prob=0, duplicate_prob=0, delete_prob=0, precision=math.inf)
+NOTHING = Reproduction(
+    segment_size=5, crossover_prob=0, insert_prob=0, duplicate_prob=0, delete_prob=0, precision=math.inf
+)
 
 
 def made(at=ONE, **changes):
@@ -178,7 +180,7 @@ def test_the_best_of_a_segment_has_all_its_children():
 
 def test_the_best_individual_stays_and_is_the_first():
     parents = some_population(count=12)
-    always = Reproduction(5, crossover_prob=1, insert_prob=1, duplicate_prob=0, delete_prob=0, precision=1)
+    always = Reproduction(segment_size=5, crossover_prob=1, insert_prob=1, duplicate_prob=0, delete_prob=0, precision=1)
 
     children = always.children(parents, torch.tensor([0.0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 20, 10]))  # in no first segment
 
@@ -192,7 +194,7 @@ def test_the_best_individual_stays_and_is_the_first():
 @pytest.mark.parametrize(("change", "sizes"), [("insert", 1), ("duplicate", 1), ("delete", -1)])
 def test_a_neuron_is_inserted_duplicated_or_deleted_and_the_others_keep_their_genes(change, sizes):
     parents = some_population()
-    how = NOTHING._replace(**{f"{change}_prob": 1})
+    how = replace(NOTHING, **{f"{change}_prob": 1})
 
     torch.manual_seed(1)
     children = how.resized(parents)
@@ -218,7 +220,7 @@ def test_insertion_duplication_and_deletion_are_independent_draws_and_come_in_th
     parents = Population(genes, torch.zeros(count, 5), torch.zeros(count, 1).bool(), torch.ones(count).long())
     i, d, x = 0.3, 0.4, 0.6
 
-    children = NOTHING._replace(insert_prob=i, duplicate_prob=d, delete_prob=x).resized(parents)
+    children = replace(NOTHING, insert_prob=i, duplicate_prob=d, delete_prob=x).resized(parents)
 
     def share(chosen) -> float:
         return chosen[1:].double().mean().item()
@@ -255,7 +257,7 @@ def test_a_crossed_child_has_a_mates_last_rows_as_far_as_both_have_neurons():
     mates = mates._replace(genes=-mates.genes, size=mates.size).take(torch.tensor([3, 2, 1, 0]))
 
     torch.manual_seed(0)
-    children = NOTHING._replace(crossover_prob=1).crossed(parents, mates)
+    children = replace(NOTHING, crossover_prob=1).crossed(parents, mates)
 
     assert torch.equal(children.genes[0], parents.genes[0])
     for child, own, other in zip(children.genes[1:], parents.size[1:], mates.size[1:], strict=True):
