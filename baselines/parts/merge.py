@@ -9,7 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
-from baselines.parts.networks import HISTORY, Data, Items
+from baselines.parts.networks import HISTORY, Data, Items, TensorsByName
 from ctgraph_rl.learn.histories import can_branch, distinct, renumber
 
 FEWEST_FRAMES = 512
@@ -44,6 +44,16 @@ def number_frames(trunk: Any, items: Items, num_minibatches: int) -> Items:
     taken = (history * (int(action.max()) + 1) + action) * 2 + gains
     _, kinds = distinct([taken.flatten(), items["action_log_prob"].flatten()])
     return {**numbers, KIND: kinds.view_as(action)}
+
+
+def merged_outputs(policy: Any, trunk: Any, batch: Data) -> tuple[Data, TensorsByName]:
+    """Return frames of a batch and the network's outputs at them: all frames, or one of each kind; see `merge`."""
+    if KIND not in batch:
+        return batch, policy.outputs(batch)
+    chosen, frames = merge(batch)
+    features, histories = trunk.of_histories(batch)
+    of_chosen = histories.index_select(0, chosen)
+    return frames, {key: value.index_select(0, of_chosen) for key, value in policy.heads(features).items()}
 
 
 def merge(batch: Data) -> tuple[Tensor, Items]:

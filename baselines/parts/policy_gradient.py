@@ -19,7 +19,7 @@ from baselines.cells.cell import MakeCell
 from baselines.cells.lstm import LSTM
 from baselines.parts import networks
 from baselines.parts.learner import Learner
-from baselines.parts.merge import KIND, mean, merge, number_frames
+from baselines.parts.merge import mean, merged_outputs, number_frames
 from baselines.parts.networks import ActorCritic, Data, Items, TensorsByName
 from baselines.update.update import OPTIMISERS, make_optimiser
 from ctgraph_rl.checks import (
@@ -87,10 +87,8 @@ class PolicyGradient(Learner):
     """An actor and a critic on one trunk; a class that derives from it defines the loss.
 
     Without memory, the frames of all rows are shuffled into minibatches. With memory, the trunk ends in a cell, whose
-    state is reset wherever ``is_init`` is set, and minibatches are whole rows, so it sees sequences in order.
-
-    Args:
-        settings: the fields of the class's `Settings`.
+    state is reset wherever ``is_init`` is set, and minibatches are whole rows, so it sees sequences in order. Settings
+    are the fields of the class's ``Settings``.
     """
 
     Settings: ClassVar[Any] = PolicyGradientSettings
@@ -143,17 +141,9 @@ class PolicyGradient(Learner):
     def evaluate_actions(self, batch: Data) -> tuple[Data, Tensor, Tensor, Tensor]:
         """Compute log-probabilities of all actions, those of the actions taken, and values, with present weights.
 
-        They are those of the frames that come first: of the batch, or of one that stands for all of its kind; see
-        `merge`.
+        They are those of the frames that come first: of the batch, or of one of each kind; see `merge`.
         """
-        frames = batch
-        if KIND not in batch:
-            outputs = self.policy.outputs(batch)
-        else:
-            chosen, frames = merge(batch)
-            features, histories = self.trunk.of_histories(batch)
-            of_chosen = histories.index_select(0, chosen)
-            outputs = {key: value.index_select(0, of_chosen) for key, value in self.policy.heads(features).items()}
+        frames, outputs = merged_outputs(self.policy, self.trunk, batch)
         log_probs = outputs["log_probs"]
         return frames, log_probs, log_probs.gather(-1, frames["action"].unsqueeze(-1)), outputs["state_value"]
 
@@ -223,9 +213,9 @@ class PolicyGradient(Learner):
         advantage, target = self.advantages(batch, next_values, done, terminated)
         if self.settings.normalize_advantage:
             of_seeds = advantage.unflatten(0, (seeds.number, -1))
-            mean = of_seeds.mean(dim=(1, 2, 3), keepdim=True)
+            centred = of_seeds - of_seeds.mean(dim=(1, 2, 3), keepdim=True)
             deviation = of_seeds.std(dim=(1, 2, 3), correction=0, keepdim=True)
-            advantage = ((of_seeds - mean) / (deviation + 1e-8)).flatten(0, 1)
+            advantage = (centred / (deviation + 1e-8)).flatten(0, 1)
         states = self.trunk.state_keys if self.memory else ()
         items = networks.sequences_of(batch, [*self.trunk.in_keys, "action", "action_log_prob"], states)
         items |= {"advantage": advantage, "value_target": target}

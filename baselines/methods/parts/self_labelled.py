@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -16,6 +16,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from typing_extensions import override
 
+from baselines.detectors.judge import Judge
 from baselines.detectors.seen import SUSPICION, Seen
 from baselines.methods.method import multi_task_blocks
 from baselines.parts.networks import sequences_of, trunk_of
@@ -24,9 +25,6 @@ from ctgraph_rl.checks import NamedValues, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.task_like import most_actions
 from ctgraph_rl.tasks.protocol import Block, Protocol
-
-if TYPE_CHECKING:
-    from baselines.detectors.detector import Detector
 
 
 class SelfLabelled:
@@ -40,7 +38,7 @@ class SelfLabelled:
         detector: what gives the labels.
     """
 
-    def __init__(self, method: MethodLike, detector: Detector) -> None:
+    def __init__(self, method: MethodLike, detector: Judge) -> None:
         self.method = method
         self.detector = detector
 
@@ -134,7 +132,7 @@ class SelfLabelledAgent(nn.Module):
     """An agent with a method, whose tasks a detector labels.
 
     At a suspicion the older of two snapshots of agent, optimiser and method is restored, and the task ends there. Then
-    the known labels start one after the other, in the order in which they were opened, for `Detector.patience` frames
+    the known labels start one after the other, in the order in which they were opened, for `Judge.patience` frames
     each; nothing is learned meanwhile. If the detector accepts none, a new label starts; where there are `max_labels`
     already, that of before the suspicion resumes. If the label of before is accepted, there was no boundary: what is
     learned is as the snapshot was.
@@ -146,7 +144,7 @@ class SelfLabelledAgent(nn.Module):
         max_labels: most labels.
     """
 
-    def __init__(self, learner: Agent, detector: Detector, policy: nn.Module, max_labels: int) -> None:
+    def __init__(self, learner: Agent, detector: Judge, policy: nn.Module, max_labels: int) -> None:
         super().__init__()
         self.learner: Any = learner
         self.detector = detector
