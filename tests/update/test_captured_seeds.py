@@ -172,7 +172,12 @@ def test_eight_seeds_learn_from_what_each_would_alone_with_its_losses_and_gradie
             its = {key: value.chunk(8)[number] for key, value in found.items()}
             torch.testing.assert_close(its, expected, rtol=1e-4, atol=1e-5)
         group.stack.write()
-        compare(next(group.first.minibatches_of(batch, group.seeds)))
+        minibatches = list(group.first.minibatches_of(batch, group.seeds))
+        for number in range(8):
+            drawn = torch.cat([minibatch["advantage"][number].flatten() for minibatch in minibatches])
+            its = found["advantage"].chunk(8)[number].flatten()
+            assert torch.equal(drawn.sort().values, its.sort().values), "each of its own frames once"
+        compare(minibatches[0])
         return CapturedGroup.learn(group, batch)
 
     monkeypatch.setattr(group, "learn", learned)
