@@ -4,23 +4,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
-from ctgraph_rl.checks import (
-    NamedValues,
-    ReadOnlyValues,
-    Rule,
-    are_ints,
-    did_you_mean,
-    is_int,
-    is_real,
-    is_shallow,
-    require,
-)
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule, are_ints, did_you_mean, is_int, is_real, require
 from ctgraph_rl.disk import read_regular
 from ctgraph_rl.strict import named, yaml_value
 from ctgraph_rl.tasks.protocol import Protocol
@@ -53,23 +43,86 @@ failed: {}                  # seeds of runs without results, each with the reaso
 """
 """A ``method.yaml`` to fill in, with a comment on every line."""
 
+EXAMPLE: ReadOnlyValues = yaml.safe_load(TEMPLATE)
 
 MOST_BYTES = 2**16
 """Largest ``method.yaml`` that is read."""
 
-MAX_NESTING = 4
-
-EXAMPLE: ReadOnlyValues = yaml.safe_load(TEMPLATE)
-
-ENTRY_POINT = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
-COMMIT = re.compile(r"[0-9a-f]{7,40}")
 HOURS_APART, SHARE_APART = 0.01, 0.05
 """How far the hours of a ``method.yaml`` may be from those of the logs."""
 
 OURS = "ctgraph_rl"
 """Stands for the repository of this package."""
 
-ADDRESS = re.compile(r"https?://\S+")
+
+class Kind(NamedTuple):
+    """What a field of a file may hold."""
+
+    holds: Callable[[Any], bool]
+    what: str  # in words
+
+
+def or_null(kind: Kind) -> Kind:
+    """Return a kind that may be missing."""
+    return Kind(lambda value: value is None or kind.holds(value), f"{kind.what} or null")
+
+
+def matching(pattern: str, what: str) -> Kind:
+    """Return the kind of texts that match a regular expression as a whole."""
+    return Kind(lambda value: isinstance(value, str) and re.fullmatch(pattern, value) is not None, what)
+
+
+def list_of(kind: Kind, what: str) -> Kind:
+    """Return the kind of lists of a kind."""
+    return Kind(lambda value: isinstance(value, list) and all(map(kind.holds, value)), what)
+
+
+def kind_rules(values: ReadOnlyValues, kinds: Mapping[str, Kind], owner: str = "") -> list[Rule]:
+    """Return the rule for each field that is there; the owner stands behind its name."""
+    rules = []
+    for name, value in values.items():
+        kind = kinds[name]
+        rules.append((kind.holds(value), f"{name}{owner} must be {kind.what}, got {value!r:.80}"))
+    return rules
+
+
+TEXT = Kind(lambda value: isinstance(value, str) and bool(value.strip()), "a text")
+COUNT = Kind(lambda value: is_int(value, 0), "an integer >= 0")
+HOURS = or_null(Kind(lambda value: is_real(value, 0), "a number >= 0"))
+
+
+def _are_reasons(value: object) -> bool:
+    """Whether it has a text for each of some seeds."""
+    return isinstance(value, Mapping) and are_ints(list(value), 0) and all(map(TEXT.holds, value.values()))
+
+
+KINDS = {
+    "name": TEXT,
+    "track": or_null(TEXT),
+    "track_version": Kind(lambda value: is_int(value, 1), "an integer >= 1"),
+    "authors": Kind(lambda value: value != [] and list_of(TEXT, "").holds(value), "a list of names"),
+    "paper": or_null(TEXT),
+    "code.repository": matching(rf"https?://\S+|{OURS}", f"an address, or {OURS}"),
+    "code.commit": matching("[0-9a-f]{7,40}", "7 to 40 hexadecimal digits, in quotes"),
+    "code.licence": TEXT,
+    "entry_point": or_null(
+        matching(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*", "module:function, such as my_learner:train,")
+    ),
+    "given.boundaries": or_null(TEXT),
+    "given.task_id": or_null(TEXT),
+    "given.guide_frames": or_null(COUNT),
+    "bytes_per_task": COUNT,
+    "tuning.how": TEXT,
+    "tuning.seeds": Kind(lambda value: are_ints(value, 0), "a list of seeds, such as [100, 101]"),
+    "compute.hardware": or_null(TEXT),
+    "compute.hours": HOURS,
+    "compute.tuning_hours": HOURS,
+    "failed": Kind(_are_reasons, "a reason for each seed, such as {3: out of memory}"),
+}
+"""Fields with dotted names; all must be there but ``track_version``, which ``submit`` writes."""
+
+PARTS = ("code", "given", "tuning", "compute")
+"""Fields that hold others."""
 
 
 def read_method(path: Path) -> NamedValues:
@@ -99,91 +152,25 @@ def check_method(method: Any) -> None:
     Raises:
         ValueError: for a missing or unknown key, and values out of range; names all of them.
     """
-    plain = isinstance(method, Mapping) and is_shallow(method, MAX_NESTING)
     fix = "ctgraph-rl submit --template prints one to fill in"
-    require((plain, f"it must hold name, authors and so on, got {method!r:.80}; {fix}"))
-    require(*_key_rules(method, EXAMPLE, ""))
-    require(*_rules(method))
-
-
-def _key_rules(given: ReadOnlyValues, example: ReadOnlyValues, prefix: str) -> list[Rule]:
-    """Return the rules that an object has the keys of another one, and so have its parts."""
-    rules = [(key in given, f"{prefix}{key} is missing; it may be null or empty") for key in example]
-    known = [*example] if prefix else [*example, "track_version"]  # which earlier submissions do not have
-    rules += [(key in known, f"unknown key {prefix}{key}: {did_you_mean(str(key), known)}") for key in given]
-    for key, part in example.items():
-        if isinstance(part, Mapping) and part and key in given:
-            is_part = isinstance(given[key], Mapping)
-            rules.append((is_part, f"{key} must have {', '.join(part)}, got {given[key]!r:.80}"))
-            rules += _key_rules(given[key], part, f"{key}.") if is_part else []
-    return rules
-
-
-def _rules(method: ReadOnlyValues) -> list[Rule]:
-    """Return the rules for the values of an object with the right keys."""
-    code = method["code"]
-    tuning = method["tuning"]
-    compute = method["compute"]
-    authors = method["authors"]
-    failed = method["failed"]
-    listed = isinstance(authors, list) and bool(authors) and all(map(_is_text, authors))
-    reasons = isinstance(failed, Mapping) and are_ints(list(failed), 0) and all(map(_is_text, failed.values()))
-    seeds = tuning["seeds"]
-    repository = code["repository"]
-    commit = code["commit"]
-    given = method["given"]
-    return [
-        _text_rule("name", method["name"]),
-        _text_rule("code.licence", code["licence"]),
-        _text_rule("given.boundaries", given["boundaries"], or_null=True),
-        _text_rule("given.task_id", given["task_id"], or_null=True),
-        _text_rule("track", method["track"], or_null=True),
-        _text_rule("paper", method["paper"], or_null=True),
-        _text_rule("tuning.how", tuning["how"]),
-        _text_rule("compute.hardware", compute["hardware"], or_null=True),
-        (listed, f"authors must be a list of names, got {authors!r:.80}"),
-        (
-            repository == OURS or _matches(ADDRESS, repository),
-            f"code.repository must be an address, or {OURS}, got {repository!r:.80}",
-        ),
-        (_matches(COMMIT, commit), f"code.commit must be 7 to 40 hexadecimal digits, in quotes, got {commit!r:.80}"),
-        (
-            method["entry_point"] is None or _matches(ENTRY_POINT, method["entry_point"]),
-            f"entry_point must be module:function, such as my_learner:train, got {method['entry_point']!r:.80}",
-        ),
-        (is_int(track_version(method), 1), f"track_version must be an integer >= 1, got {track_version(method)!r:.80}"),
-        _count_rule("given.guide_frames", given["guide_frames"], or_null=True),
-        _count_rule("bytes_per_task", method["bytes_per_task"]),
-        (are_ints(seeds, 0), f"tuning.seeds must be a list of seeds, such as [100, 101], got {seeds!r:.80}"),
-        _hours_rule("hours", compute["hours"]),
-        _hours_rule("tuning_hours", compute["tuning_hours"]),
-        (reasons, f"failed must have a reason for each seed, such as {{3: out of memory}}, got {failed!r:.80}"),
-    ]
-
-
-def _is_text(value: object) -> bool:
-    return isinstance(value, str) and bool(value.strip())
-
-
-def _matches(pattern: re.Pattern[str], value: object) -> bool:
-    return isinstance(value, str) and pattern.fullmatch(value) is not None
-
-
-def _text_rule(name: str, value: object, or_null: bool = False) -> Rule:
-    return _rule(name, value, _is_text(value), "a text", or_null)
-
-
-def _count_rule(name: str, value: object, or_null: bool = False) -> Rule:
-    return _rule(name, value, is_int(value, 0), "an integer >= 0", or_null)
-
-
-def _hours_rule(name: str, value: object) -> Rule:
-    return _rule(f"compute.{name}", value, is_real(value, 0), "a number >= 0", or_null=True)
-
-
-def _rule(name: str, value: object, holds: bool, what: str, or_null: bool) -> Rule:
-    choice = f"{what} or null" if or_null else what
-    return holds or (or_null and value is None), f"{name} must be {choice}, got {value!r:.80}"
+    require((isinstance(method, Mapping), f"it must hold name, authors and so on, got {method!r:.80}; {fix}"))
+    values: NamedValues = {}
+    rules = []
+    for key, value in method.items():
+        if key not in PARTS:
+            values[key] = value
+            continue
+        is_part = isinstance(value, Mapping)
+        rules.append((is_part, f"{key} must have {', '.join(EXAMPLE[key])}, got {value!r:.80}"))
+        for name, each in value.items() if is_part else ():
+            values[f"{key}.{name}"] = each
+    known = list(KINDS)
+    for name in known:
+        rules.append((name in values or name == "track_version", f"{name} is missing; it may be null or empty"))
+    for name in values:
+        rules.append((name in KINDS, f"unknown key {name}: {did_you_mean(str(name), known)}"))
+    require(*rules)
+    require(*kind_rules(values, KINDS))
 
 
 def completed(method: ReadOnlyValues, facts: Mapping[str, ReadOnlyValues]) -> NamedValues:
@@ -200,12 +187,7 @@ def completed(method: ReadOnlyValues, facts: Mapping[str, ReadOnlyValues]) -> Na
 
 
 def facts_of(protocol: Protocol, runs: Sequence[Any]) -> dict[str, NamedValues]:
-    """Return what the runs of a submission say of the method themselves.
-
-    Args:
-        protocol: of what they learned.
-        runs: the submitted runs.
-    """
+    """Return what the submitted runs say of the method, under ``given`` and ``compute``."""
     given = {key: getattr(protocol, key) for key in EXAMPLE["given"]}
     shared: dict[Any, float] = {}
     machines: dict[str, None] = {}
@@ -227,20 +209,20 @@ def fact_rules(
         runs: the submitted runs.
         num_tasks: of the curriculum.
     """
-    hours = method["compute"]["hours"]
-    logged = facts["compute"]["hours"]
-    near = hours is None or abs(hours - logged) <= max(HOURS_APART, SHARE_APART * logged)
-    kept = method["bytes_per_task"] * (num_tasks - 1)
-    largest = max((run.agent_bytes or 0 for run in runs), default=0)
-    fits = not largest or kept <= largest
-    all_kept = f"{kept:,} bytes for {num_tasks - 1} further tasks"
-    further = method["bytes_per_task"]
-    less = f"bytes_per_task is {further}, {all_kept}, the agents of the runs have {largest:,} bytes in all: correct it"
     rules = []
     for key, known in facts["given"].items():
         said = method["given"][key]
-        rules.append(
-            (said in (None, known), f"given.{key} is {said!r}, the runs were given {known!r}: write null, or that")
-        )
+        contradiction = f"given.{key} is {said!r}, the runs were given {known!r}: write null, or that"
+        rules.append((said in (None, known), contradiction))
+    hours = method["compute"]["hours"]
+    logged = facts["compute"]["hours"]
+    near = hours is None or abs(hours - logged) <= max(HOURS_APART, SHARE_APART * logged)
     rules.append((near, f"compute.hours is {hours}, the logs of the runs have {logged}: write null, or that"))
-    return [*rules, (fits, less)]
+    each = method["bytes_per_task"]
+    kept = each * (num_tasks - 1)
+    largest = max((run.agent_bytes or 0 for run in runs), default=0)
+    said = f"bytes_per_task is {each}, {kept:,} bytes for {num_tasks - 1} further tasks"
+    rules.append(
+        (not largest or kept <= largest, f"{said}, the agents of the runs have {largest:,} bytes in all: correct it")
+    )
+    return rules

@@ -6,24 +6,36 @@ up: a rerun finds that.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 from ctgraph_rl.board.method_yaml import fact_rules, facts_of, track_version
 from ctgraph_rl.board.submission import Submission, SubmittedRun, experts_of, log_sum
-from ctgraph_rl.board.submission_rules import curriculum_rule, entry_rule, oracle_rule, seed_rules
+from ctgraph_rl.board.tracks import Track
 from ctgraph_rl.checks import ReadOnlyValues, Rule, require
 from ctgraph_rl.learn.evaluate import Evaluator
 from ctgraph_rl.log.escape import listed
+from ctgraph_rl.log.named_curricula import is_published
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.scores import scores
+from ctgraph_rl.packages import class_named
 from ctgraph_rl.parsers import LEVELS
 from ctgraph_rl.report.columns import board_columns
-from ctgraph_rl.runs.settings import differences
+from ctgraph_rl.runs.load import OURS
+from ctgraph_rl.runs.read import MODIFIED
+from ctgraph_rl.runs.settings import differences, with_added
+from ctgraph_rl.tasks.curriculum import Curriculum
 
 RESCORED = LEVELS[0]
 
 NO_ROW: ReadOnlyValues = {}
+
+OF_OURS = "baselines."
+"""Beginning of the names of our classes."""
+
+MAY_BE_READ = ("", "the frames of each block")
+"""What methods may read of tasks beside what the protocol gives: a track fixes the frames of its blocks."""
 
 
 class Check(NamedTuple):
@@ -164,3 +176,108 @@ def of_the_protocol(submission: Submission, run: SubmittedRun, log: RunLog) -> I
         if some:
             notes.append(f"{what} (frames, task, episodes): {listed(sorted(some, key=str))}")
     yield Check("evaluations", str(len(wanted)), str(len(there)), wanted == there, run.run, note="; ".join(notes))
+
+
+# rules of a submission, pairs of (holds, message)
+
+
+def curriculum_rule(curriculum: Curriculum, of_track: Track | None) -> Rule:
+    """Return the rule that a curriculum is one of a track, or without a track the published one of its name."""
+    name = curriculum.name.removesuffix(MODIFIED)
+    found = curriculum.fingerprint
+    if of_track is not None:
+        wanted = of_track.by_fingerprint
+        return found in wanted, (
+            f"curriculum {name} has fingerprint {found}, track {of_track.id} has {', '.join(wanted)}: "
+            f"run ctgraph-rl -m track={of_track.name}, with no other curriculum, protocol or evaluation"
+        )
+    published = is_published(replace(curriculum, name=name))
+    if published is None:
+        return False, f"no published curriculum is named {name}: run a published one, or name a track that has it"
+    fix = "run it without changes, or name a track that has it"
+    return published, f"curriculum {name} (fingerprint {found}) is not the published one, it was modified: {fix}"
+
+
+def seed_rules(seeds: Iterable[int], tuned: Iterable[int], of_track: Track | None) -> list[Rule]:
+    """Return the rules that the seeds are those of the track, and that none was used for tuning.
+
+    Args:
+        seeds: of the runs.
+        tuned: seeds that the method says it was tuned on.
+        of_track: the track; None: any seeds that were not used for tuning.
+    """
+    own = set(seeds)
+    used = own & set(tuned)
+    rules = [(not used, f"seeds {listed(sorted(used))} are among tuning.seeds: submit runs of other seeds")]
+    if of_track is None:
+        return rules
+    wanted = set(of_track.seeds)
+    reserved = own & set(of_track.tuning_seeds)
+    missing = wanted - own
+    others = own - wanted - reserved
+    asked = f"track {of_track.id} has seeds {_ranges(wanted)}"
+    return [
+        *rules,
+        (not missing, f"seeds {listed(sorted(missing))} are missing: {asked}"),
+        (not reserved, f"seeds {listed(sorted(reserved))} are for tuning: {asked}"),
+        (not others, f"seeds {listed(sorted(others))} are of no submission: {asked}"),
+    ]
+
+
+def _ranges(seeds: Iterable[int]) -> str:
+    """Return seeds in words, such as ``0..9``."""
+    ordered = sorted(seeds)
+    whole = len(ordered) > 2 and ordered == list(range(ordered[0], ordered[-1] + 1))
+    return f"{ordered[0]}..{ordered[-1]}" if whole else ", ".join(map(str, ordered))
+
+
+def entry_rule(config: ReadOnlyValues, entry_point: str | None) -> Rule:
+    """Return the rule that there is a way to run a configuration again."""
+    agent = config.get("agent")
+    is_built = isinstance(agent, Mapping) and "_target_" in agent
+    fix = "set entry_point: module:function in method.yaml, a function (curriculum, seed, run_dir) that trains a run"
+    return is_built or entry_point is not None, f"no agent can be built from the configuration of the runs: {fix}"
+
+
+def oracle_rule(config: ReadOnlyValues) -> Rule:
+    """Return the rule that a method or detector of ours reads no more of the tasks than the learner is given.
+
+    A class of `baselines` goes by the name of the module that defines it only: what other names stand for is unknown.
+    """
+    unknown = []
+    named = []
+    parts: dict[str, object] = {}
+    for group in ("method", "detector"):
+        settings = config.get(group)
+        if not isinstance(settings, Mapping):
+            continue
+        name = str(settings.get("_target_"))
+        kind = _kind(group, name)
+        part = None if kind is None else _part(kind, settings)
+        if part is not None:
+            parts[group] = part
+            named.append(f"{group}={type(part).__name__}")
+        elif kind is None and name.startswith(OF_OURS):
+            unknown.append(f"{group}={name}")
+    if unknown:
+        return False, f"{listed(unknown)} is no method or detector of baselines: name it by the module that defines it"
+    reads = getattr(parts.get("method"), "reads_tasks", "")
+    is_oracle = getattr(parts.get("detector"), "is_oracle", False)
+    return reads in MAY_BE_READ and not is_oracle, (
+        f"{' '.join(named)} is an oracle, which reads {reads or 'the true tasks'}: it is a reference for others, "
+        f"submit runs without it"
+    )
+
+
+def _kind(part: str, name: str) -> type | None:
+    """Return the class of `baselines` that a group names; None for any other."""
+    ours = OURS[part].fullmatch(name)
+    return None if ours is None else class_named(ours[1], ours[2])
+
+
+def _part(kind: type, settings: ReadOnlyValues) -> object:
+    """Return what a group of a configuration builds of one of our classes; None for settings of another version."""
+    try:
+        return kind(**{key: value for key, value in with_added(settings).items() if not key.startswith("_")})
+    except (TypeError, ValueError):
+        return None

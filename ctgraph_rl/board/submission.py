@@ -19,12 +19,13 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from ctgraph_rl.board.method_yaml import check_method
+from ctgraph_rl.board.method_yaml import COUNT, Kind, check_method, kind_rules, list_of, matching, or_null
 from ctgraph_rl.board.tracks import Track, track
-from ctgraph_rl.checks import NamedValues, ReadOnlyValues, are_ints, is_int, is_real, is_shallow, repeated, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_int, is_real, repeated, require
 from ctgraph_rl.disk import read_regular
+from ctgraph_rl.log.escape import listed
 from ctgraph_rl.log.measurement import without_time
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.runs.settings import as_before
@@ -43,45 +44,74 @@ SCHEMA = 2
 MOST_BYTES, MOST_BYTES_OF_A_LOG = 2**24, 2**26
 """Largest ``submission.json``, 16 MiB, and largest log, before and after it is unpacked, 64 MiB."""
 
-MAX_NESTING = 16
-"""Of a configuration."""
-
 MOST_RUNS, MOST_SECONDS = 10_000, 1e9
 """Of a submission, and of a run."""
 
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.=-]{0,119}")
 """Names of runs, which are names of files."""
 
-SUM = re.compile(r"[0-9a-f]{64}")
-
 NOT_COUNTED = ("versions", "machine", "num_threads", "cpu", "source", "num_frames")
 """Fields of a log's first line that its sum leaves out; the fingerprint stands for source and frames."""
 
+
+class Field(NamedTuple):
+    """A field of ``submission.json``."""
+
+    kind: Kind
+    meaning: str
+
+
+OBJECT = Kind(lambda value: isinstance(value, dict), "an object")
+ANY_TEXT = Kind(lambda value: isinstance(value, str), "a text")
+SUM = matching("[0-9a-f]{64}", "64 hexadecimal digits")
+
+
+def _are_texts(value: object) -> bool:
+    return isinstance(value, dict) and all(isinstance(each, str) for each in value.values())
+
+
+def _are_runs(value: object) -> bool:
+    return isinstance(value, list) and 0 < len(value) <= MOST_RUNS
+
+
 PARTS = {
-    "schema": "version of this format",
-    "method": "what `method.yaml` says, without the failed seeds",
-    "config": "the configuration that all runs share, without the seed",
-    "versions": "versions of the packages and of Python that computed the runs, by name",
-    "curriculum": "what was learned, see `Curriculum.to_json`",
-    "runs": "an object for each seed",
+    "schema": Field(Kind(lambda value: is_int(value, SCHEMA, SCHEMA), str(SCHEMA)), "version of this format"),
+    "method": Field(OBJECT, "what `method.yaml` says, without the failed seeds"),
+    "config": Field(Kind(OBJECT.holds, "settings"), "the configuration that all runs share, without the seed"),
+    "versions": Field(
+        Kind(_are_texts, "texts by name"),
+        "versions of the packages and of Python that computed the runs, by name",
+    ),
+    "curriculum": Field(OBJECT, "what was learned, see `Curriculum.to_json`"),
+    "runs": Field(Kind(_are_runs, f"a list of 1..{MOST_RUNS:,}"), "an object for each seed"),
 }
-"""Keys of ``submission.json`` with their meaning."""
+"""Keys of ``submission.json``."""
 
 RUN = {
-    "run": "name of the run, and of its log in `logs/`",
-    "seed": "its seed",
-    "reason": "why it failed or was stopped; null for a finished run",
-    "group": "seeds that were trained together as one batch; empty for a run without others",
-    "agent_sha256": "SHA-256 of the agent's state: names, types, shapes and bits; null where a run left none",
-    "agent_bytes": "bytes of all tensors of that state",
-    "log_sha256": "SHA-256 of the log without times, versions and machine",
-    "experts": "such a sum for the log of each single-task expert",
-    "machine": "kind of machine that it ran on",
-    "num_threads": "threads of torch",
-    "cpu": "model of the CPU; empty where the system does not say",
-    "seconds": "time of the run; runs of one group share it",
+    "run": Field(matching(NAME.pattern, "a name of a file"), "name of the run, and of its log in `logs/`"),
+    "seed": Field(COUNT, "its seed"),
+    "reason": Field(or_null(ANY_TEXT), "why it failed or was stopped; null for a finished run"),
+    "group": Field(
+        list_of(COUNT, "a list of seeds"),
+        "seeds that were trained together as one batch; empty for a run without others",
+    ),
+    "agent_sha256": Field(
+        or_null(SUM), "SHA-256 of the agent's state: names, types, shapes and bits; null where a run left none"
+    ),
+    "agent_bytes": Field(or_null(COUNT), "bytes of all tensors of that state"),
+    "log_sha256": Field(SUM, "SHA-256 of the log without times, versions and machine"),
+    "experts": Field(
+        list_of(SUM, "sums of 64 hexadecimal digits"), "such a sum for the log of each single-task expert"
+    ),
+    "machine": Field(ANY_TEXT, "kind of machine that it ran on"),
+    "num_threads": Field(COUNT, "threads of torch"),
+    "cpu": Field(ANY_TEXT, "model of the CPU; empty where the system does not say"),
+    "seconds": Field(
+        Kind(lambda value: is_real(value, 0, MOST_SECONDS), f"a number in 0..{MOST_SECONDS:,.0f}"),
+        "time of the run; runs of one group share it",
+    ),
 }
-"""Keys of each of the ``runs`` with their meaning."""
+"""Keys of each of the ``runs``."""
 
 
 @dataclass(frozen=True)
@@ -183,14 +213,20 @@ def read_submission(path: Path | str, of_track: Track | None = None, config_dir:
     data = read_regular(file, MOST_BYTES)
     with named(file):
         content = json_value(data)
-        _check_parts(content)
+        _check_fields(content, PARTS, "must be an object of")
         runs = tuple(sorted(map(_run, content["runs"]), key=lambda run: run.seed))
-        _check_runs(runs)
+        names = sorted(repeated(run.run.lower() for run in runs))
+        seeds = sorted(repeated(str(run.seed) for run in runs))
+        require(
+            ("seed" not in content["config"], "config must leave out the seed, which the runs have"),
+            (not names, f"names a run twice: {listed(names)}"),
+            (not seeds, f"has a seed twice: {listed(seeds)}"),
+        )
         method = {**content["method"], "failed": {run.seed: run.reason for run in runs if not run.finished}}
         check_method(method)
         curriculum = Curriculum.from_json(content["curriculum"])
     absent = [log_name(run.run) for run in runs if not (path / log_name(run.run)).is_file()]
-    require((not absent, f"{path} lacks {', '.join(absent[:3])}, which {SUBMISSION} names"))
+    require((not absent, f"{path} lacks {listed(absent)}, which {SUBMISSION} names"))
     if of_track is None and method["track"] is not None:
         of_track = track(method["track"], config_dir)
     return Submission(
@@ -205,81 +241,21 @@ def read_submission(path: Path | str, of_track: Track | None = None, config_dir:
     )
 
 
-def _check_parts(content: Any) -> None:
-    """Refuse what has other parts than a submission, or parts of other kinds."""
-    is_object = isinstance(content, dict)
-    require((is_object and {*content} == {*PARTS}, f"must be an object of {', '.join(PARTS)}, got {content!r:.80}"))
-    config = content["config"]
-    versions = content["versions"]
-    runs = content["runs"]
-    texts = isinstance(versions, dict) and {*map(type, versions.values())} <= {str}
-    require(
-        (
-            is_int(content["schema"], SCHEMA, SCHEMA),
-            f"has schema {content['schema']!r:.80}, this reads {SCHEMA}",
-        ),
-        (isinstance(content["method"], dict), f"method must be an object, got {content['method']!r:.80}"),
-        (isinstance(config, dict) and is_shallow(config, MAX_NESTING), f"config must be settings, got {config!r:.80}"),
-        (not isinstance(config, dict) or "seed" not in config, "config must leave out the seed, which the runs have"),
-        (texts, f"versions must be texts by name, got {versions!r:.80}"),
-        (isinstance(content["curriculum"], dict), "curriculum must be an object"),
-        (
-            isinstance(runs, list) and 0 < len(runs) <= MOST_RUNS,
-            f"runs must be a list of 1..{MOST_RUNS:,}, got {runs!r:.80}",
-        ),
-    )
+def _check_fields(given: Any, fields: Mapping[str, Field], what: str, owner: str = "") -> None:
+    """Refuse what is no object of these fields, each of its kind."""
+    whole = isinstance(given, dict) and {*given} == {*fields}
+    require((whole, f"{what} {', '.join(fields)}, got {given!r:.80}"))
+    require(*kind_rules(given, {name: field.kind for name, field in fields.items()}, owner))
 
 
 def _run(given: Any) -> SubmittedRun:
     """Return one of the runs."""
-    require((isinstance(given, dict) and {*given} == {*RUN}, f"a run must have {', '.join(RUN)}, got {given!r:.80}"))
-    name = given["run"]
-    sums = given["experts"]
-    rules = [(isinstance(name, str) and NAME.fullmatch(name) is not None, f"run must name a file, got {name!r:.80}")]
-    for key in ("seed", "num_threads"):
-        rules.append((is_int(given[key], 0), f"{key} of {name!r:.80} must be an integer >= 0, got {given[key]!r:.80}"))
-    for key in ("machine", "cpu"):
-        rules.append((isinstance(given[key], str), f"{key} of {name!r:.80} must be a text, got {given[key]!r:.80}"))
-    rules += [
-        (are_ints(given["group"], 0), f"group of {name!r:.80} must be a list of seeds, got {given['group']!r:.80}"),
-        (_is_sum(given["log_sha256"]), f"log_sha256 of {name!r:.80} must be 64 hexadecimal digits"),
-        (
-            isinstance(sums, list) and all(map(_is_sum, sums)),
-            f"experts of {name!r:.80} must be sums of 64 hexadecimal digits",
-        ),
-        (
-            given["agent_sha256"] is None or _is_sum(given["agent_sha256"]),
-            f"agent_sha256 of {name!r:.80} must be 64 hexadecimal digits or null",
-        ),
-        (
-            given["agent_bytes"] is None or is_int(given["agent_bytes"], 0),
-            f"agent_bytes of {name!r:.80} must be an integer >= 0 or null, got {given['agent_bytes']!r:.80}",
-        ),
-        (
-            is_real(given["seconds"], 0, MOST_SECONDS),
-            f"seconds of {name!r:.80} must be a number in 0..{MOST_SECONDS:,.0f}, got {given['seconds']!r:.80}",
-        ),
-        (
-            given["reason"] is None or isinstance(given["reason"], str),
-            f"reason of {name!r:.80} must be a text or null, got {given['reason']!r:.80}",
-        ),
-    ]
-    require(*rules)
-    return SubmittedRun(**{**given, "group": tuple(given["group"]), "experts": tuple(sums)})
-
-
-def _is_sum(value: object) -> bool:
-    return isinstance(value, str) and SUM.fullmatch(value) is not None
-
-
-def _check_runs(runs: tuple[SubmittedRun, ...]) -> None:
-    """Refuse a run or a seed that is there twice."""
-    names = sorted(repeated(run.run.lower() for run in runs))
-    seeds = sorted(repeated(str(run.seed) for run in runs))
-    require(
-        (not names, f"names a run twice: {', '.join(names[:3])}"),
-        (not seeds, f"has a seed twice: {', '.join(seeds[:3])}"),
-    )
+    owner = f" of {given.get('run')!r:.80}" if isinstance(given, dict) else ""
+    _check_fields(given, RUN, "a run must have", owner)
+    values = dict(given)
+    values["group"] = tuple(given["group"])
+    values["experts"] = tuple(given["experts"])
+    return SubmittedRun(**values)
 
 
 def submission_text(

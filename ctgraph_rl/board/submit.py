@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import math
+import json
 import os
 import sys
-from collections.abc import Mapping, Sequence
-from itertools import filterfalse
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import chain, filterfalse
 from pathlib import Path
-from typing import Any
 
 from ctgraph_rl import parsers
-from ctgraph_rl.board import submission as files
 from ctgraph_rl.board.method_yaml import TEMPLATE, completed, fact_rules, facts_of, read_method
-from ctgraph_rl.board.rescore import rescore
+from ctgraph_rl.board.rescore import curriculum_rule, entry_rule, oracle_rule, rescore, seed_rules
 from ctgraph_rl.board.submission import (
+    LOGS,
+    NAME,
+    SUBMISSION,
     Submission,
     SubmittedRun,
     experts_of,
@@ -24,31 +26,20 @@ from ctgraph_rl.board.submission import (
     read_submission,
     submission_text,
 )
-from ctgraph_rl.board.submission_rules import (
-    code_rules,
-    curriculum_rule,
-    entry_rule,
-    failure_rules,
-    oracle_rule,
-    same_rules,
-    seed_rules,
-)
 from ctgraph_rl.board.tracks import Track, track
-from ctgraph_rl.checks import ReadOnlyValues, Rule, is_real, repeated, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule, repeated, require
 from ctgraph_rl.disk import made_folder, new_folder, require_new, write_whole
+from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.escape import listed, terminal_text
 from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG, locked_new
+from ctgraph_rl.log.provenance import NUMBERS, code_changes
 from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.saved import count_bytes, read_content, read_plain, sum_of_state
-from ctgraph_rl.log.scores import scores
-from ctgraph_rl.metrics import Metric
+from ctgraph_rl.log.sources import SCRIPTS, find_sources
 from ctgraph_rl.runs.read import Run, find_runs, why_left_out
 from ctgraph_rl.runs.settings import flat
 from ctgraph_rl.tasks.curriculum import Curriculum
-
-ROUNDING = 1e-9
-"""Largest difference, as a share of the value, between what two kinds of machines compute from one log."""
 
 
 def submit(
@@ -76,9 +67,12 @@ def submit(
         BlockingIOError: if another process makes it.
     """
     require_new(to)
-    runs, curriculum = _checked(_found(paths, only or {}), method, of_track)
-    names = _names(runs)
-    lines = [_line(run, name, method["failed"]) for run, name in zip(runs, names, strict=True)]
+    runs = _found(paths, only or {})
+    experts = {run.seed: _experts(run) for run in runs if run.reason is None}
+    curriculum = _checked(runs, experts, method, of_track)
+    lines = []
+    for run, name in zip(runs, _names(runs), strict=True):
+        lines.append(_line(run, name, method["failed"].get(run.seed), experts.get(run.seed, {})))
     facts = facts_of(curriculum.protocol, lines)
     require(*fact_rules(method, facts, lines, len(curriculum.tasks)))
     about = completed(method, facts)
@@ -88,11 +82,19 @@ def submit(
         about |= {"track": of_track.name, "track_version": of_track.version}
     made_folder(to.absolute().parent)
     with locked_new(to), new_folder(to) as folder:
-        _write(folder, runs, lines, about, curriculum=curriculum)
+        made_folder(folder / LOGS)
+        for run, line in zip(runs, lines, strict=True):
+            write_whole(folder / log_name(line.run), packed((run.path / LOG).read_bytes()))
+            for number, path in experts.get(run.seed, {}).items():
+                write_whole(folder / log_name(line.run, number), packed(path.read_bytes()))
+        config = dict(runs[0].about["config"])
+        config.pop("seed", None)
+        content = submission_text(about, config, runs[0].about["versions"], curriculum, tuple(lines))
+        write_whole(folder / SUBMISSION, content)
         made = read_submission(folder, of_track)
         wrong = [check.text for check in rescore(made) if not check.passed]
         require((not wrong, f"the submission would not pass its own check: {listed(wrong)}"))
-    return read_submission(to, of_track)
+    return replace(made, path=to)
 
 
 def _found(paths: Sequence[Path], only: ReadOnlyValues) -> list[Run]:
@@ -112,8 +114,10 @@ def _found(paths: Sequence[Path], only: ReadOnlyValues) -> list[Run]:
     return sorted(chosen, key=lambda run: run.seed)
 
 
-def _checked(runs: list[Run], method: ReadOnlyValues, of_track: Track | None) -> tuple[list[Run], Curriculum]:
-    """Return the runs, and what they learned; refuse what cannot be submitted."""
+def _checked(
+    runs: Sequence[Run], experts: Mapping[int, Mapping[int, Path]], method: ReadOnlyValues, of_track: Track | None
+) -> Curriculum:
+    """Return what runs learned; refuse what cannot be submitted, with every broken rule."""
     seeds = [run.seed for run in runs]
     rules = [*same_rules(runs), *code_rules(runs), *failure_rules(runs, method["failed"])]
     rules += seed_rules(seeds, method["tuning"]["seeds"], of_track)
@@ -121,22 +125,19 @@ def _checked(runs: list[Run], method: ReadOnlyValues, of_track: Track | None) ->
     rules += [entry_rule(config, method["entry_point"]), oracle_rule(config)]
     curricula = [run.path / CURRICULUM for run in runs]
     unwritten = list(filterfalse(Path.exists, curricula))
-    message = f"{listed(unwritten)} is missing, as of curricula with classes of your own: submit a named curriculum"
-    rules.append((not unwritten, message))
-    first = None if unwritten else Curriculum.from_json(curricula[0])
-    if first is not None:
-        other = [run.path for run in runs if run.curriculum[1] != first.fingerprint]
-        message = f"the logs of {listed(other)} are of another curriculum than {curricula[0]}"
-        rules += [curriculum_rule(first, of_track), (not other, message)]
-    fix = "submit from the directory that the run was started in"
+    fix = "as of curricula with classes of your own: submit a named curriculum"
+    rules.append((not unwritten, f"{listed(unwritten)} is missing, {fix}"))
     for run in runs:
-        experts = _experts(run) if run.reason is None else {}
-        missing = list(filterfalse(Path.is_file, experts.values()))
-        message = f"{run.path} was trained with experts, {listed(missing)} cannot be found: {fix}"
-        rules.append((not missing, message))
-    require(*rules)
-    assert first is not None
-    return runs, first
+        missing = list(filterfalse(Path.is_file, experts.get(run.seed, {}).values()))
+        fix = "submit from the directory that the run was started in"
+        rules.append((not missing, f"{run.path} was trained with experts, {listed(missing)} cannot be found: {fix}"))
+    if unwritten:
+        require(*rules)
+    first = Curriculum.from_json(curricula[0])
+    other = [run.path for run in runs if run.curriculum[1] != first.fingerprint]
+    rules.append((not other, f"the logs of {listed(other)} are of another curriculum than {curricula[0]}"))
+    require(*rules, curriculum_rule(first, of_track))
+    return first
 
 
 def _experts(run: Run) -> dict[int, Path]:
@@ -147,25 +148,29 @@ def _experts(run: Run) -> dict[int, Path]:
 def _names(runs: Sequence[Run]) -> list[str]:
     """Return a name for each run: that of its directory, or its seed where these are no different names of files."""
     names = [run.path.resolve().name for run in runs]
-    usable = all(map(files.NAME.fullmatch, names)) and not repeated(map(str.lower, names))
+    usable = all(map(NAME.fullmatch, names)) and not repeated(map(str.lower, names))
     return names if usable else [f"seed{run.seed}" for run in runs]
 
 
-def _line(run: Run, name: str, reasons: Mapping[int, str]) -> SubmittedRun:
+def _line(run: Run, name: str, reason: str | None, experts: Mapping[int, Path]) -> SubmittedRun:
     """Return a run as ``submission.json`` has it."""
     log = RunLog.read(run.path / LOG)
-    finished = run.reason is None
-    state = _state(run.path / AGENT) if finished and (run.path / AGENT).exists() else None
-    experts = _experts(run).values() if finished else ()
+    agent = run.path / AGENT
+    state = None
+    if run.reason is None and agent.exists():
+        try:
+            state = read_plain(read_content(agent))
+        except ValueError as error:
+            raise ValueError(f"{agent} {error}: save a state_dict there, or nothing") from error
     return SubmittedRun(
         run=name,
         seed=run.seed,
-        reason=None if finished else reasons[run.seed],
+        reason=reason,
         group=tuple(run.about.get("together") or ()),
         agent_sha256=None if state is None else sum_of_state(state),
         agent_bytes=None if state is None else count_bytes(state),
         log_sha256=log_sum(log),
-        experts=tuple(log_sum(RunLog.read(path)) for path in experts),
+        experts=tuple(log_sum(RunLog.read(path)) for path in experts.values()),
         machine=str(run.about.get("machine", "")),
         num_threads=int(run.about.get("num_threads", 1)),
         cpu=str(run.about.get("cpu") or ""),
@@ -173,54 +178,77 @@ def _line(run: Run, name: str, reasons: Mapping[int, str]) -> SubmittedRun:
     )
 
 
-def _state(path: Path) -> Any:
-    """Return what an agent saved."""
-    try:
-        return read_plain(read_content(path))
-    except ValueError as error:
-        raise ValueError(f"{path} {error}: save a state_dict there, or nothing") from error
+def same_rules(runs: Sequence[Run]) -> Iterator[Rule]:
+    """Yield the rules that all runs are of one configuration, one curriculum and one code."""
+    nameless = [run.path for run in runs if run.agent is None]
+    fix = 'give Recorder(about={"learner": ...})'
+    yield not nameless, f"{listed(nameless)} do not name their learner: {fix}"
+    curricula = {f"{run.curriculum[0]} (fingerprint {run.curriculum[1]})" for run in runs}
+    yield len(curricula) == 1, f"runs are of several curricula, {listed(sorted(curricula))}: submit those of one"
+    several = {} if nameless else _differing([run.settings for run in runs])
+    shown = listed(map("=".join, several.items()))
+    yield not several, f"runs are of several configurations, {shown}: submit those of one"
+    mixed = _differing([run.code for run in runs], absent="")
+    yield not mixed, f"runs are of different code, {listed(mixed)} differs between them: run all with one"
+    other = _differing([run.about.get("versions") or {} for run in runs])
+    shown = listed(map(" ".join, other.items()))
+    yield not other, f"runs are of different versions, {shown}: run all with one"
 
 
-def _write(
-    folder: Path,
-    runs: Sequence[Run],
-    lines: Sequence[SubmittedRun],
-    method: ReadOnlyValues,
-    *,
-    curriculum: Curriculum,
-) -> None:
-    """Write all files of a submission."""
-    made_folder(folder / files.LOGS)
-    for run, line in zip(runs, lines, strict=True):
-        write_whole(folder / log_name(line.run), packed((run.path / LOG).read_bytes()))
-        if not line.finished:
+def _differing(given: Sequence[ReadOnlyValues], absent: object = None) -> dict[str, str]:
+    """Return the names that have several values, each with these in words."""
+    found = {}
+    for name in dict.fromkeys(chain(*given)):
+        values: dict[str, None] = {}
+        for each in given:
+            values[json.dumps(each.get(name, absent), sort_keys=True).strip('"')] = None
+        if len(values) > 1:
+            found[name] = " and ".join(values)
+    return found
+
+
+def code_rules(runs: Sequence[Run]) -> Iterator[Rule]:
+    """Yield the rules that the code of all runs is known, and that it has not changed since."""
+    unknown: list[Path] = []
+    unsaid: list[Path] = []
+    changed: dict[str, None] = {}
+    for run in runs:
+        if None in run.code.values():
+            unknown.append(run.path)
+        elif run.about.get("sources") is None:
+            unsaid.append(run.path)
+        changed |= dict.fromkeys(code_changes(run.about, _code_now(run.about)))
+    fix = "run again from files, and with Recorder(code=[MyLearner])"
+    yield not unknown + unsaid, f"{listed(unknown + unsaid)} do not say of which source they are: {fix}"
+    yield not changed, f"the code has changed since the runs, {listed(changed)}: run again, or submit with that code"
+
+
+def _code_now(about: ReadOnlyValues) -> NamedValues:
+    """Return the code of this process, as far as a run's log names its parts; None for what cannot be found."""
+    stored = about.get("sources") or {}
+    found = find_sources(stored.keys() - {*SCRIPTS})
+    sources = {**dict.fromkeys(stored), **found} if about.get("sources") is not None else None
+    return {"fingerprint": about["fingerprint"], "numbers": NUMBERS, "sources": sources}
+
+
+def failure_rules(runs: Sequence[Run], reasons: Mapping[int, str]) -> Iterator[Rule]:
+    """Yield the rules that every run is finished and whole, or accounted for.
+
+    Args:
+        runs: the runs.
+        reasons: why runs failed or were stopped, by seed.
+    """
+    for run in runs:
+        known = run.seed in reasons
+        fix = f"finish it, or account for it: failed: {{{run.seed}: why}} in method.yaml"
+        if run.reason is not None:
+            yield known, f"{run.path} has no results ({run.reason}): {fix}"
             continue
-        experts = _experts(run)
-        for number, path in experts.items():
-            write_whole(folder / log_name(line.run, number), packed(path.read_bytes()))
-        log = RunLog.read(run.path / LOG)
-        found = scores(log, curriculum, list(map(RunLog.read, experts.values())) or None)
-        require(_metrics_rule(run, found))
-    config = dict(runs[0].about["config"])
-    config.pop("seed", None)
-    content = submission_text(method, config, runs[0].about["versions"], curriculum, tuple(lines))
-    write_whole(folder / files.SUBMISSION, content)
-
-
-def near(one: object, other: object) -> bool:
-    """Return whether two values are equal up to the rounding of another machine."""
-    if not (is_real(one) and is_real(other)):
-        return one == other
-    return math.isclose(one, other, rel_tol=ROUNDING, abs_tol=ROUNDING)  # type: ignore[arg-type]
-
-
-def _metrics_rule(run: Run, found: Mapping[str, Metric]) -> Rule:
-    """Return the rule that the metrics of a run are what its log gives, up to the rounding of another machine."""
-    other = []
-    for name, stored in run.metrics.items():
-        if name in found and not near(stored["value"], found[name].value):
-            other.append(f"{name} {stored['value']} for {found[name].value}")
-    return not other, f"{run.path} has metrics that its log does not give, {listed(other)}: run it again"
+        yield not known, f"failed has seed {run.seed}, but {run.path} is finished: remove the seed from failed"
+        lost = damaged(run.path)
+        yield not lost, f"{run.path} has files that are not as they were written, {listed(lost)}: run it again"
+    without = sorted(set(reasons) - {run.seed for run in runs})
+    yield not without, f"failed has seeds {listed(without)}, of which there is no run: give their directories, too"
 
 
 def main() -> None:

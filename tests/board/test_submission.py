@@ -22,7 +22,7 @@ def test_the_page_of_the_format_lists_every_file_and_key():
     plain = [key for key, value in EXAMPLE.items() if not isinstance(value, dict) or not value]
 
     for meanings in (PARTS, RUN):
-        assert "\n".join(f"| `{name}` | {meaning} |" for name, meaning in meanings.items()) in page
+        assert "\n".join(f"| `{name}` | {meaning} |" for name, (_, meaning) in meanings.items()) in page
     for name in (SUBMISSION, VERIFICATION, *plain, *(key.removesuffix(".") for key in keys)):
         assert f"`{name}`" in page
 
@@ -41,7 +41,7 @@ def test_the_digest_is_that_of_the_file_that_has_the_sums_of_all_logs(submission
     [
         (lambda given: given.pop("method"), "must be an object of schema, method, config, versions, curriculum, runs"),
         (lambda given: given.update(more=1), "must be an object of schema, method"),
-        (lambda given: given.update(schema=3), "has schema 3, this reads 2"),
+        (lambda given: given.update(schema=3), "schema must be 2, got 3"),
         (lambda given: given["method"].pop("name"), "name is missing"),
         (lambda given: given["method"].update(nam="x"), "unknown key nam: did you mean 'name'"),
         (lambda given: given["config"].update(seed=1), "config must leave out the seed, which the runs have"),
@@ -61,7 +61,7 @@ def test_what_is_no_submission_is_refused_with_the_file_and_the_key(submission, 
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"run": "../tiny-seed1"}, r"run must name a file, got '../tiny-seed1'"),
+        ({"run": "../tiny-seed1"}, r"run of '../tiny-seed1' must be a name of a file, got '../tiny-seed1'"),
         ({"run": "tiny-seed0"}, "names a run twice: tiny-seed0"),
         ({"seed": 0}, "has a seed twice: 0"),
         ({"seed": "1"}, "seed of 'tiny-seed1' must be an integer >= 0, got '1'"),

@@ -19,9 +19,8 @@ from helpers.sweeping import command_line
 from ctgraph_rl import Recorder, RunLog
 from ctgraph_rl.board import submit as module
 from ctgraph_rl.board.method_yaml import fact_rules, read_method
-from ctgraph_rl.board.rescore import scores_of
+from ctgraph_rl.board.rescore import oracle_rule, scores_of
 from ctgraph_rl.board.submission import log_sum, read_submission
-from ctgraph_rl.board.submission_rules import oracle_rule
 from ctgraph_rl.board.submit import submit
 from ctgraph_rl.log.files import locked_new
 from ctgraph_rl.log.provenance import NUMBERS
@@ -134,13 +133,6 @@ def damage(run: Path) -> None:
     (run / "performance.csv").write_text("block\n")
 
 
-def other_metric(run: Path) -> None:
-    metrics = json.loads((run / "metrics.json").read_text())
-    metrics["average_performance"]["value"] = 0.75
-    (run / "metrics.json").write_text(json.dumps(metrics))
-    (run / "sums.json").unlink()
-
-
 @pytest.mark.parametrize(
     ("broken", "message"),
     [
@@ -164,7 +156,6 @@ def other_metric(run: Path) -> None:
         ),
         (failed, r"tiny-seed1 has no results \(failed: FloatingPointError: the loss is nan\): finish it"),
         (damage, "tiny-seed1 has files that are not as they were written, performance.csv: run it again"),
-        (other_metric, "tiny-seed1 has metrics that its log does not give, average_performance 0.75 for 0"),
         (shutil.rmtree, "seeds 1 are missing: track tiny-v1 has seeds 0, 1"),
     ],
 )
