@@ -76,7 +76,8 @@ def test_the_board_knows_all_fields_that_a_verification_writes(submission):
     ("change", "why"),
     [
         ("[", "Expecting value: line 1 column 2"),
-        ("[1]", "its schema must be 1, got None"),
+        ("[1]", "it must be an object, got [1]"),
+        ("{}", "its schema must be 1, got None"),
         ({"schema": 2}, "its schema must be 1, got 2"),
         ({"level": ["x"]}, r"its level must be none, rescored, rerun, held_out, got ['x']"),
         ({"level": {}}, "its level must be none, rescored, rerun, held_out, got {}"),

@@ -9,16 +9,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ctgraph_rl.board import verify
-from ctgraph_rl.board.method_yaml import track_version
+from ctgraph_rl.board.method_yaml import Kind, kind_rules, list_of, track_version
 from ctgraph_rl.board.rescore import Check, scores_of
 from ctgraph_rl.board.submission import SUBMISSION, VERIFICATION, Submission, read_submission
 from ctgraph_rl.board.tracks import Track, Variant
-from ctgraph_rl.checks import NamedValues, ReadOnlyValues, repeated, require
+from ctgraph_rl.checks import ReadOnlyValues, is_int, repeated, require
 from ctgraph_rl.disk import read_regular
 from ctgraph_rl.log.escape import listed
 from ctgraph_rl.report.bounds_of_runs import bounds_of_curriculum
 from ctgraph_rl.report.columns import board_columns
-from ctgraph_rl.report.intervals import Bounds, within_bounds
+from ctgraph_rl.report.intervals import within_bounds
 from ctgraph_rl.runs.read import Problem
 from ctgraph_rl.strict import files_below, json_value, one_line_of, too_deep
 
@@ -154,7 +154,7 @@ def make_entry(submission: Submission) -> BoardEntry:
     """Return a submission as an entry.
 
     Raises:
-        ValueError: if it is for no track, or not of the track that it names, and for values that no metric has.
+        ValueError: if it is for no track, or not of the track that it names, and for values out of a metric's bounds.
     """
     track = submission.track
     name = submission.method["name"]
@@ -174,8 +174,14 @@ def make_entry(submission: Submission) -> BoardEntry:
     by_seed = {run.seed: scores_of(submission, run) for run in submission.finished}
     values = {}
     for metric in dict.fromkeys((track.score, *board_columns(submission.curriculum))):
-        limits = bounds.of_metric(metric)
-        values[metric] = tuple(_value(by_seed.get(seed, {}).get(metric), metric, limits) for seed in track.seeds)
+        low, high = bounds.of_metric(metric)
+        of_seeds = []
+        for seed in track.seeds:
+            value = by_seed.get(seed, {}).get(metric)
+            fits = value is None or (math.isfinite(value) and within_bounds([value], (low, high)))
+            require((fits, f"the logs give {metric} {value}, it must be in [{low:g}, {high:g}]"))
+            of_seeds.append(value)
+        values[metric] = tuple(of_seeds)
     return BoardEntry(
         digest=submission.digest,
         method=submission.method,
@@ -190,70 +196,50 @@ def make_entry(submission: Submission) -> BoardEntry:
     )
 
 
-def _value(value: float | None, metric: str, bounds: Bounds) -> float | None:
-    """Return a metric of a run; None for one without.
-
-    Raises:
-        ValueError: for what is not within the bounds of the metric.
-    """
-    low, high = bounds
-    fits = value is None or (math.isfinite(value) and within_bounds([value], bounds))
-    require((fits, f"the logs give {metric} {value}, it must be in [{low:g}, {high:g}]"))
-    return value
-
-
 def verification_of(submission: Submission) -> Verification:
     """Return how far a submission was verified; what is of other files, or no verification, counts for nothing."""
     path = submission.path / VERIFICATION
     if not path.is_file():
         return Verification("submitted")
     try:
-        found = _plain(json_value(read_regular(path, MOST_BYTES)))
+        found = json_value(read_regular(path, MOST_BYTES))
+        _check_verification(found)
     except (OSError, ValueError) as error:
         why = f"{VERIFICATION} counts for nothing, {error}; verify the submission again"
         return Verification("submitted", why_none=why)
-    if found["digest"] != submission.digest:
+    if found.get("digest") != submission.digest:
         return Verification("submitted", why_none=f"{VERIFICATION} is of other files; verify the submission again")
-    return Verification(OF_FILES[found["level"]], found["bits"])
+    return Verification(OF_FILES[found["level"]], found.get("bits", True))
 
 
-def _plain(found: Any) -> NamedValues:
-    """Return what a ``verification.json`` says, if its level follows from its checks.
-
-    Raises:
-        ValueError: for what is no verification.
-    """
-    given = {"bits": True, **(found if isinstance(found, dict) else {})}
+def _check_verification(given: Any) -> None:
+    """Refuse what is no ``verification.json``, or one whose level does not follow from its checks."""
+    require((isinstance(given, dict), f"it must be an object, got {given!r:.80}"))
     unknown = [name for name in given if name not in FIELDS]
-    schema = given.get("schema")
-    level = given.get("level")
-    bits = given["bits"]
-    checks = _checks(given.get("checks"))
-    require(
-        (type(schema) is int and schema == verify.SCHEMA, f"its schema must be {verify.SCHEMA}, got {schema!r:.80}"),
-        (isinstance(level, str) and level in OF_FILES, f"its level must be {', '.join(OF_FILES)}, got {level!r:.80}"),
-        (isinstance(bits, bool), f"its bits must be true or false, got {bits!r:.80}"),
-        (not unknown, f"it has unknown fields, {listed(unknown)}"),
-        (checks is not None, "its checks must be a list of checks with what, level and passed"),
-    )
-    reached = verify.level_of(checks or ())
-    require((reached == level, f"its checks give the level {reached}, not {level}"))
-    return {**given, "digest": given.get("digest")}
+    present = {name: given.get(name) for name in ("schema", "level", "checks")}
+    present["bits"] = given.get("bits", True)
+    rules = [(holds, f"its {message}") for holds, message in kind_rules(present, KINDS)]
+    require(*rules, (not unknown, f"it has unknown fields, {listed(unknown)}"))
+    checks = [Check(*(check.get(name, "") for name in Check._fields)) for check in given["checks"]]
+    reached = verify.level_of(checks)
+    require((reached == given["level"], f"its checks give the level {reached}, not {given['level']}"))
 
 
-def _checks(found: Any) -> list[Check] | None:
-    """Return the checks of a ``verification.json``; None for what are none."""
-    if not isinstance(found, list):
-        return None
-    checks = []
-    for each in found:
-        if not isinstance(each, dict) or not set(each) <= {*Check._fields}:
-            return None
-        check = Check(*(each.get(name, "") for name in Check._fields))
-        if type(check.passed) not in (bool, type(None)) or {*map(type, (*check[:3], *check[4:]))} != {str}:
-            return None
-        checks.append(check)
-    return checks
+def _is_check(value: Any) -> bool:
+    """Whether it has what a `Check` has, texts and whether it passed."""
+    if not isinstance(value, dict) or not {*value} <= {*Check._fields}:
+        return False
+    texts = {type(each) for name, each in value.items() if name != "passed"}
+    return texts <= {str} and type(value.get("passed", "")) in (bool, type(None))
+
+
+KINDS = {
+    "schema": Kind(lambda value: is_int(value, verify.SCHEMA, verify.SCHEMA), str(verify.SCHEMA)),
+    "level": Kind(lambda value: isinstance(value, str) and value in OF_FILES, ", ".join(OF_FILES)),
+    "bits": Kind(lambda value: isinstance(value, bool), "true or false"),
+    "checks": list_of(Kind(_is_check, ""), "a list of checks with what, level and passed"),
+}
+"""Of ``verification.json``, as far as a board reads it."""
 
 
 def shown_level(level: str) -> str:
