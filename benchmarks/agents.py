@@ -27,13 +27,11 @@ import torch
 from rich.console import Console
 from rich.progress import track
 
-from baselines.parts.catalogue import CatalogueEntry, catalogue
+from baselines.parts.catalogue import catalogue
 from benchmarks import agent_ladder
-from benchmarks.environment_ladder import climbed, found, until
-from benchmarks.environment_ladder import table as ladder_table
-from benchmarks.environments import machine
+from benchmarks import environment_ladder as ladder
 from ctgraph_rl import CTGraphEnv, Task, evaluate
-from ctgraph_rl.checks import NamedValues, at_least_one, positive, require
+from ctgraph_rl.checks import NamedValues, at_least_one, require
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.learn.collect import collect
 from ctgraph_rl.log.escape import markdown_table
@@ -105,11 +103,6 @@ class Contender:
         self.solved.append(None)
 
 
-def agent_named(name: str) -> CatalogueEntry:
-    """Return the class and hyperparameters of an agent."""
-    return next(entry for entry in catalogue("agent") if entry.name == name)
-
-
 def cell_named(name: str) -> partial[Any]:
     """Return what builds a cell with the settings of its file."""
     entry = next(entry for entry in catalogue("cell") if entry.name == name)
@@ -118,7 +111,7 @@ def cell_named(name: str) -> partial[Any]:
 
 def settings(name: str) -> NamedValues:
     """Return an agent's hyperparameters for `ROWS` rows, with as many frames in a batch as in its yaml file."""
-    given = agent_named(name).settings
+    given = agent_ladder.settings(name)
     frames = given["num_envs"] * given["num_steps"]
     return {**given, "num_envs": ROWS, "num_steps": max(1, frames // ROWS)}
 
@@ -134,12 +127,11 @@ class Ours:
     """
 
     def __init__(self, name: str, task: Task, seed: int, cell: str | None = None) -> None:
-        given = settings(name) | ({} if cell is None else {"cell": cell_named(cell)})
+        changes = settings(name) | ({} if cell is None else {"cell": cell_named(cell)})
         torch.manual_seed(seed)
-        env = CTGraphEnv([task] * given["num_envs"], seed)
+        env = CTGraphEnv([task] * ROWS, seed)
         self.task = task
-        make_agent = agent_named(name).kind
-        self.agent = agent = make_agent(env.observation_spec_unbatched, env.action_spec_unbatched, **given)
+        self.agent = agent = agent_ladder.built(name, task, **changes)
         batch = agent.num_envs * agent.num_steps
         agent.start_task()
         self.batches = collect(env, agent.policy, 10**6 * batch, agent.num_steps, agent.initial_state)
@@ -201,63 +193,46 @@ def _solved(found: list[tuple[int, float] | None]) -> tuple[str, str]:
     return f"{frames:,.0f}", f"{seconds:.2f}"
 
 
-def on_device(device: torch.device, options: argparse.Namespace) -> str:
+def on_device(device: torch.device, options: ladder.Options) -> str:
     """Measure `benchmarks.agent_ladder` on a device, with the agents of the options; return the table."""
-    rungs = [
-        rung
-        for rung in agent_ladder.rungs(device, options.rows, options.together)
-        if rung.name == agent_ladder.ENVIRONMENT or rung.name.partition(",")[0] in options.agents
-    ]
-    rows = found(climbed(rungs, options, device), agent_ladder.ENVIRONMENT)
-    return f"{machine(device)}; medians of {options.rounds} rounds\n\n{ladder_table(rows, agent_ladder.ENVIRONMENT)}"
-
-
-def _options(arguments: list[str] | None) -> argparse.Namespace:
-    """Return the options of the command line.
-
-    Raises:
-        ValueError: for numbers out of range.
-    """
-    names = list(dict.fromkeys(name for name, _ in PAIRS))
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.agents", description=__doc__)
-    parser.add_argument("--agents", nargs="+", default=names, choices=names, help="who is measured")
-    known = [entry.name for entry in catalogue("cell")]
-    parser.add_argument("--cells", nargs="*", choices=known, help="instead: lstm_ppo with these cells; none named: all")
-    parser.add_argument("--rounds", type=int, default=5, help="how often each is measured")
-    parser.add_argument("--seconds", type=float, default=2.0, help="least time of a measurement")
-    parser.add_argument("--seeds", type=int, default=3, help="how often each learns from scratch")
-    parser.add_argument(
-        "--max-frames", type=int, default=500_000, help="frames after which a task counts as not solved"
-    )
-    parser.add_argument("--limit", type=float, default=3600.0, help="seconds after which no measurement begins")
-    parser.add_argument("--device", default=None, help="instead: PPO and LSTM-PPO on one device, such as cuda")
-    parser.add_argument("--rows", type=int, nargs="+", default=[4096, 65536], help="with --device: environments")
-    parser.add_argument("--together", type=int, nargs="*", default=[64, 1024], help="with --device: seeds of one job")
-    options = parser.parse_args(arguments)
-    require(
-        *at_least_one(rounds=options.rounds, max_frames=options.max_frames),
-        *at_least_one(rows=min(options.rows), together=min(options.together, default=1)),
-        (options.seeds >= 0, f"seeds must be >= 0, got {options.seeds}"),
-        *positive(seconds=options.seconds, limit=options.limit),
-    )
-    if options.cells == []:
-        options.cells = known
-    return options
+    rungs = []
+    for rung in agent_ladder.rungs(device, options.rows, options.together):
+        if rung.name == agent_ladder.ENVIRONMENT or rung.name.partition(",")[0] in options.agents:
+            rungs.append(rung)
+    ladder.climb(rungs, options, device)
+    return ladder.report(rungs, options, device, agent_ladder.ENVIRONMENT)
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Measure and print the table."""
-    options = _options(arguments)
+    names = list(dict.fromkeys(name for name, _ in PAIRS))
+    known = [entry.name for entry in catalogue("cell")]
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.agents", description=__doc__)
+    parser.add_argument("--agents", nargs="+", default=names, choices=names, help="who is measured")
+    parser.add_argument("--cells", nargs="*", choices=known, help="instead: lstm_ppo with these cells; none named: all")
+    parser.add_argument("--seeds", type=int, default=3, help="how often each learns from scratch")
+    longest = "frames after which a task counts as not solved"
+    parser.add_argument("--max-frames", type=int, default=500_000, help=longest)
+    parser.add_argument("--rows", type=int, nargs="+", default=[4096, 65536], help="with --device: environments")
+    parser.add_argument("--together", type=int, nargs="*", default=[64, 1024], help="with --device: seeds of one job")
+    options = ladder.parsed(parser, arguments, seconds=2.0, limit=3600.0)
+    require(
+        *at_least_one(max_frames=options.max_frames, rows=min(options.rows), together=min(options.together, default=1)),
+        (options.seeds >= 0, f"seeds must be >= 0, got {options.seeds}"),
+    )
+    if options.cells == []:
+        options.cells = known
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     if options.device:
         print(on_device(checked_device(options.device), options))
         return
     measured = learned(options)
-    print(f"{machine()}; medians of {options.rounds} rounds and {options.seeds} seeds\n\n{table(measured)}")
+    about = f"{ladder.machine(torch.device('cpu'))}; medians of {options.rounds} rounds and {options.seeds} seeds"
+    print(f"{about}\n\n{table(measured)}")
 
 
-def learned(options: argparse.Namespace) -> list[Contender]:
+def learned(options: ladder.Options) -> list[Contender]:
     """Let agents learn for as long as the options say, or until Ctrl-C; return them with their measurements."""
     console = Console(stderr=True)
     if not find_spec("sb3_contrib"):
@@ -270,11 +245,13 @@ def learned(options: argparse.Namespace) -> list[Contender]:
     start = time.perf_counter()
     pairs = list(zip(measured, learners, strict=True))
     with suppress(KeyboardInterrupt):
-        for contender, learner in until(options.limit, track(pairs * options.rounds, "measuring", console=console)):
+        for contender, learner in ladder.until(
+            options.limit, track(pairs * options.rounds, "measuring", console=console)
+        ):
             contender.measure(learner, options.seconds)
         left = options.limit - (time.perf_counter() - start)
         work = [(seed, contender) for seed in range(options.seeds) for contender in measured]
-        for seed, contender in until(left, track(work, "learning", console=console)):
+        for seed, contender in ladder.until(left, track(work, "learning", console=console)):
             contender.solve(seed, options.max_frames)
     return measured
 

@@ -5,13 +5,15 @@ The yardstick is a copy of as many bytes as the observations have, on the same d
 
 from __future__ import annotations
 
+import argparse
+import platform
 import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from rich.console import Console
@@ -20,6 +22,7 @@ from torch import Tensor
 
 from ctgraph_rl.batch.rollout import Steps, rollout
 from ctgraph_rl.batch.rows import Rows
+from ctgraph_rl.checks import at_least_one, positive, require
 from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.dynamics import RowState, Words
 from ctgraph_rl.core.region import WARM_UP, Region
@@ -30,6 +33,8 @@ from ctgraph_rl.log.escape import markdown_table
 from ctgraph_rl.tasks.task import Task
 
 T = TypeVar("T")
+Options = argparse.Namespace
+
 TimedRun = Callable[[], int]
 """Runs for a while, and returns the number of observations."""
 
@@ -199,20 +204,57 @@ def _replayed(region: Region, rows: Rows, actions: Tensor) -> TimedRun:
     return run
 
 
-class Options(Protocol):
-    """How long to measure: options of the command line."""
+def parsed(parser: argparse.ArgumentParser, arguments: list[str] | None, seconds: float, limit: float) -> Options:
+    """Return the options of a benchmark, those of all benchmarks among them.
 
-    rounds: int
-    seconds: float
-    limit: float
+    Args:
+        parser: with the options of one benchmark.
+        arguments: of the command line; None: those of this process.
+        seconds: least time of a measurement, the default.
+        limit: seconds after which no measurement begins, the default.
+
+    Raises:
+        ValueError: for numbers out of range.
+    """
+    parser.add_argument("--rounds", type=int, default=5, help="how often each is measured")
+    parser.add_argument("--seconds", type=float, default=seconds, help="least time of a measurement")
+    parser.add_argument("--limit", type=float, default=limit, help="seconds after which no measurement begins")
+    parser.add_argument("--device", default=None, help="instead: the ladder of the tensor engine there, such as cuda")
+    options = parser.parse_args(arguments)
+    require(*at_least_one(rounds=options.rounds), *positive(seconds=options.seconds, limit=options.limit))
+    return options
 
 
-def climbed(rungs: list[Rung], options: Options, device: torch.device) -> list[Rung]:
-    """Measure a ladder for as long as the options say, or until Ctrl-C; return it."""
+def climb(rungs: list[Rung], options: Options, device: torch.device, in_turn: bool = False) -> None:
+    """Measure a ladder for as long as the options say, or until Ctrl-C.
+
+    Args:
+        rungs: the ladder.
+        options: of the command line.
+        device: of all rungs.
+        in_turn: every round measures each rung once, so that what slows the machine down slows all; else each rung is
+            made, measured and dropped.
+    """
+    rounds = 1 if in_turn else options.rounds
+    times = options.rounds if in_turn else 1
     with suppress(KeyboardInterrupt):
-        for rung in until(options.limit, track(rungs, "measuring", console=Console(stderr=True))):
-            measure(rung, options.rounds, options.seconds, device)
-    return rungs
+        for rung in until(options.limit, track(rungs * times, "measuring", console=Console(stderr=True))):
+            measure(rung, rounds, options.seconds, device)
+
+
+def report(rungs: list[Rung], options: Options, device: torch.device, yardstick: str = COPY) -> str:
+    """Return on which machine a ladder was measured, and its table."""
+    about = f"{machine(device)}; medians of {options.rounds} rounds"
+    return f"{about}\n\n{table(found(rungs, yardstick), yardstick)}"
+
+
+def machine(device: torch.device) -> str:
+    """Return what was measured on."""
+    if device.type == "cuda":
+        return f"{torch.cuda.get_device_name(device)}, CUDA {torch.version.cuda}, torch {torch.__version__}"
+    threads = torch.get_num_threads()
+    capability = torch.backends.cpu.get_cpu_capability()
+    return f"{platform.processor() or platform.machine()}, {capability}, {threads} threads, torch {torch.__version__}"
 
 
 def measure(rung: Rung, rounds: int, seconds: float, device: torch.device) -> None:
@@ -273,9 +315,10 @@ def found(measured: Sequence[Rung], yardstick: str = COPY) -> list[dict[str, Any
         if speed is None:
             rows.append({**row, "failure": rung.failure})
             continue
-        yardsticks = {
-            n: each for (name, n, task), each in median.items() if name == yardstick and task in ("", rung.task)
-        }
+        yardsticks = {}
+        for (name, n, task), each in median.items():
+            if name == yardstick and task in ("", rung.task):
+                yardsticks[n] = each
         ratio = speed / yardsticks.get(rung.num_rows, yardsticks[max(yardsticks)]) if yardsticks else None
         rows.append({**row, "per_second": speed, "ratio": ratio, "goal": rung.goal or None, "rounds": len(rung.speeds)})
     return rows

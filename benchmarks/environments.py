@@ -1,25 +1,19 @@
 """How fast the environment runs, with --device cuda on a GPU.
 
 Every round measures each way to step once, one after the other, so what slows the machine down slows all of them; the
-table has the medians of the rounds, and an observation is one row for one step. The yardsticks are memset and memcpy of
-as many bytes as the observations have, and a native TorchRL environment that does nothing but count, where some rows
-end at every step, as in any batch of episodes.
+table has the medians of the rounds, and an observation is one row for one step. The yardstick is memcpy of as many
+bytes as the observations have. A TorchRL environment that only counts is measured, too; some of its rows end at every
+step, as in any batch of episodes.
 """
 
 from __future__ import annotations
 
 import argparse
-import platform
-import statistics
-import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import torch
-from rich.console import Console
-from rich.progress import track
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -28,13 +22,13 @@ from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from benchmarks import environment_ladder as ladder
+from benchmarks.environment_ladder import Rung, TimedRun
 from ctgraph_rl.batch.rollout import Steps, rollout
 from ctgraph_rl.batch.rows import Rows
-from ctgraph_rl.checks import at_least_one, positive, require
+from ctgraph_rl.checks import at_least_one, require
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.gym import CTGraphGymEnv, CTGraphVectorEnv
-from ctgraph_rl.log.escape import markdown_table
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_su_b1
 from ctgraph_rl.tasks.task import Task
 
@@ -45,7 +39,7 @@ MAX_BUFFER = 2**26
 """Bytes of observations in the buffers: beyond the caches."""
 
 
-NamedRuns = Iterator[tuple[str, ladder.TimedRun]]
+NamedRuns = Iterator[tuple[str, TimedRun]]
 """Ways to step, by name."""
 
 NOISE_BANK = 4096
@@ -65,25 +59,6 @@ def configurations() -> dict[str, Task]:
     for name, task in tuple(tasks.items()):
         tasks[f"{name}, noise 10"] = replace(task, observations=replace(task.observations, read_noise=10))
     return tasks
-
-
-@dataclass
-class Way:
-    """One way to step."""
-
-    name: str
-    configuration: str
-    num_rows: int
-    run: ladder.TimedRun  # runs for a while and says how many observations there were
-    speeds: list[float]
-
-    def measure(self, seconds: float) -> None:
-        """Observations a second over at least so many seconds."""
-        count = 0
-        start = time.perf_counter()
-        while time.perf_counter() - start < seconds:
-            count += self.run()
-        self.speeds.append(count / (time.perf_counter() - start))
 
 
 class Counter(EnvBase):
@@ -228,12 +203,13 @@ def _single(task: Task, kernel: str) -> NamedRuns:
     yield f"Gymnasium Env{SUFFIX[kernel]}", run
 
 
-def contenders(num_rows: list[int], names: list[str], with_kernel: bool) -> list[Way]:
-    """Everything that is measured, in the order of the table."""
-    found: list[Way] = []
+def contenders(num_rows: list[int], names: list[str], with_kernel: bool) -> list[Rung]:
+    """Everything that is measured on the CPU, in the order of the table."""
+    found: list[Rung] = []
 
     def add(configuration: str, n: int, ways: NamedRuns) -> None:
-        found.extend(Way(name, configuration, n, run, []) for name, run in ways)
+        for name, run in ways:
+            found.append(Rung(name, configuration, n, lambda run=run: run))
 
     tasks = configurations()
     ways = tuple(SUFFIX)[: 1 + with_kernel]
@@ -253,81 +229,30 @@ def contenders(num_rows: list[int], names: list[str], with_kernel: bool) -> list
     return found
 
 
-def table(measured: list[Way]) -> str:
-    """Medians in Markdown, with their spread over the rounds and their ratios to the yardsticks of the same rows."""
-    rows = []
-    median = {(one.num_rows, one.configuration, one.name): statistics.median(one.speeds) for one in measured}
-    for one in measured:
-        speed = statistics.median(one.speeds)
-        spread = (max(one.speeds) - min(one.speeds)) / speed / 2
-        yardstick = median.get((one.num_rows, "", MEMCPY))
-        trivial = median.get((one.num_rows, "", TRIVIAL + one.name.removesuffix(SUFFIX["required"]).removesuffix(LEAN)))
-        cells = [
-            f"{one.num_rows:,}",
-            one.configuration,
-            one.name,
-            f"{speed / 1e6:.3g}",
-            f"±{100 * spread:.0f} %",
-            f"{speed / yardstick:.2g}" if yardstick else "",
-            f"{speed / trivial:.2f}" if trivial else "",
-        ]
-        rows.append(cells)
-    return markdown_table(("rows", "task", "way", "M obs/s", "spread", "/ memcpy", "/ trivial"), rows)
-
-
-def machine(device: torch.device | None = None) -> str:
-    """Return what was measured on."""
-    if device is not None and device.type == "cuda":
-        return f"{torch.cuda.get_device_name(device)}, CUDA {torch.version.cuda}, torch {torch.__version__}"
-    threads = torch.get_num_threads()
-    capability = torch.backends.cpu.get_cpu_capability()
-    return f"{platform.processor() or platform.machine()}, {capability}, {threads} threads, torch {torch.__version__}"
-
-
-def _options(arguments: list[str] | None) -> argparse.Namespace:
-    """Return the options of the command line."""
+def main(arguments: list[str] | None = None) -> None:
+    """Measure and print the table."""
     names = list(configurations())
     parser = argparse.ArgumentParser(prog="python -m benchmarks.environments", description=__doc__)
     parser.add_argument("--rows", type=int, nargs="+", help="batch sizes")
     parser.add_argument("--tasks", nargs="+", default=names, choices=names, help="what is measured")
-    parser.add_argument("--rounds", type=int, default=5, help="how often each is measured")
-    parser.add_argument("--seconds", type=float, default=0.2, help="least time of a measurement")
     parser.add_argument("--skip-kernel", action="store_true", help="leave out the C kernel, which needs a compiler")
     parser.add_argument("--threads", type=int, default=None, help="threads of torch")
-
-    parser.add_argument("--device", default=None, help="instead: the ladder of the tensor engine there, such as cuda")
-    parser.add_argument("--limit", type=float, default=600.0, help="seconds after which no measurement begins")
-    options = parser.parse_args(arguments)
-    options.rows = options.rows or ([65536, 262144] if options.device else [1, 64, 1024, 16384])
-    return options
-
-
-def main(arguments: list[str] | None = None) -> None:
-    """Measure and print the table."""
-    options = _options(arguments)
-
-    require(
-        *at_least_one(rounds=options.rounds, rows=min(options.rows)),
-        *positive(seconds=options.seconds, limit=options.limit),
-    )
+    options = ladder.parsed(parser, arguments, seconds=0.2, limit=600.0)
+    rows = options.rows or ([65536, 262144] if options.device else [1, 64, 1024, 16384])
+    require(*at_least_one(rows=min(rows)))
     if options.threads:
         torch.set_num_threads(options.threads)
     if options.device:
         device = checked_device(options.device)
         tasks = {name: configurations()[name] for name in options.tasks}
-        measured_there = ladder.climbed(ladder.rungs(device, options.rows, tasks), options, device)
-        print(f"{machine(device)}; medians of {options.rounds} rounds\n\n{ladder.table(ladder.found(measured_there))}")
+        measured = ladder.rungs(device, rows, tasks)
+        ladder.climb(measured, options, device)
+        print(ladder.report(measured, options, device))
         return
-    measured = contenders(options.rows, options.tasks, not options.skip_kernel)
-    console = Console(stderr=True)
-    with suppress(KeyboardInterrupt):
-        for one in track(measured, "filling caches", console=console):
-            one.run()
-        rounds = track(measured * options.rounds, "measuring", console=console)
-        for one in ladder.until(options.limit, rounds):
-            one.measure(options.seconds)
-    found = [one for one in measured if one.speeds]
-    print(f"{machine()}; medians of {options.rounds} rounds\n\n{table(found)}")
+    device = torch.device("cpu")
+    measured = contenders(rows, options.tasks, not options.skip_kernel)
+    ladder.climb(measured, options, device, in_turn=True)
+    print(ladder.report(measured, options, device, MEMCPY))
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ import torch
 
 from benchmarks import agent_ladder as learning
 from benchmarks import environment_ladder as ladder
-from benchmarks.environments import configurations, machine
+from benchmarks.environments import configurations
 from ctgraph_rl.log.provenance import versions
 from studies.raw import HERE
 
@@ -56,7 +56,7 @@ def parts(device: torch.device, options: argparse.Namespace, before: Mapping[str
         before: the report of an earlier call, which is continued if it is of the same commit and device.
     """
     end = time.perf_counter() + SHARE * 60 * options.minutes
-    about = {"device": machine(device), "driver": said("nvidia-smi", *DRIVER), "versions": versions()}
+    about = {"device": ladder.machine(device), "driver": said("nvidia-smi", *DRIVER), "versions": versions()}
     commit = options.commit or present_commit()
     known = before if before.get("commit") == commit and before.get("machine") == about else {}
     yield "machine", about
