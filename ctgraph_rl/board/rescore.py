@@ -7,6 +7,7 @@ up: a rerun finds that.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -16,7 +17,7 @@ from ctgraph_rl.board.tracks import Track
 from ctgraph_rl.checks import ReadOnlyValues, Rule, require
 from ctgraph_rl.learn.evaluate import Evaluator
 from ctgraph_rl.log.escape import listed
-from ctgraph_rl.log.named_curricula import is_published
+from ctgraph_rl.log.provenance import is_published
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.packages import class_named
@@ -243,41 +244,28 @@ def oracle_rule(config: ReadOnlyValues) -> Rule:
     """Return the rule that a method or detector of ours reads no more of the tasks than the learner is given.
 
     A class of `baselines` goes by the name of the module that defines it only: what other names stand for is unknown.
+    A method is built, as its settings decide; a detector, whose settings may ask for any memory, is not.
     """
+    kinds: dict[str, type] = {}
     unknown = []
-    named = []
-    parts: dict[str, object] = {}
+    reads = ""
     for group in ("method", "detector"):
         settings = config.get(group)
-        if not isinstance(settings, Mapping):
-            continue
-        name = str(settings.get("_target_"))
-        kind = _kind(group, name)
-        part = None if kind is None else _part(kind, settings)
-        if part is not None:
-            parts[group] = part
-            named.append(f"{group}={type(part).__name__}")
-        elif kind is None and name.startswith(OF_OURS):
+        name = str(settings.get("_target_")) if isinstance(settings, Mapping) else ""
+        ours = OURS[group].fullmatch(name)
+        kind = None if ours is None else class_named(ours[1], ours[2])
+        if kind is not None:
+            kinds[group] = kind
+        elif name.startswith(OF_OURS):
             unknown.append(f"{group}={name}")
     if unknown:
         return False, f"{listed(unknown)} is no method or detector of baselines: name it by the module that defines it"
-    reads = getattr(parts.get("method"), "reads_tasks", "")
-    is_oracle = getattr(parts.get("detector"), "is_oracle", False)
-    return reads in MAY_BE_READ and not is_oracle, (
-        f"{' '.join(named)} is an oracle, which reads {reads or 'the true tasks'}: it is a reference for others, "
-        f"submit runs without it"
-    )
-
-
-def _kind(part: str, name: str) -> type | None:
-    """Return the class of `baselines` that a group names; None for any other."""
-    ours = OURS[part].fullmatch(name)
-    return None if ours is None else class_named(ours[1], ours[2])
-
-
-def _part(kind: type, settings: ReadOnlyValues) -> object:
-    """Return what a group of a configuration builds of one of our classes; None for settings of another version."""
-    try:
-        return kind(**{key: value for key, value in with_added(settings).items() if not key.startswith("_")})
-    except (TypeError, ValueError):
-        return None
+    if "method" in kinds:
+        given = {key: value for key, value in with_added(config["method"]).items() if not key.startswith("_")}
+        with suppress(TypeError, ValueError):  # settings of another version
+            reads = getattr(kinds["method"](**given), "reads_tasks", "")
+    if getattr(kinds.get("detector"), "is_oracle", False):
+        reads = "the true tasks"
+    oracles = " ".join(f"{group}={kind.__name__}" for group, kind in kinds.items())
+    fix = "it is a reference for others, submit runs without it"
+    return reads in MAY_BE_READ, f"{oracles} is an oracle, which reads {reads}: {fix}"

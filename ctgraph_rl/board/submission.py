@@ -27,6 +27,7 @@ from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_int, is_real, repe
 from ctgraph_rl.disk import read_regular
 from ctgraph_rl.log.escape import listed
 from ctgraph_rl.log.measurement import without_time
+from ctgraph_rl.log.named_curricula import curriculum_named
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.runs.settings import as_before
 from ctgraph_rl.strict import json_value, named
@@ -188,8 +189,12 @@ class Submission:
             OSError: if one of them cannot be read.
         """
         found = []
+        left = MOST_BYTES_OF_A_LOG  # of all of them together
         for each in experts_of(log):
-            found.append(read_log(self.path / log_name(run.run, each["task"])))
+            path = self.path / log_name(run.run, each["task"])
+            content = unpacked(path, left)
+            left -= len(content)
+            found.append(RunLog.of_content(content, path))
         return found or None
 
 
@@ -224,11 +229,11 @@ def read_submission(path: Path | str, of_track: Track | None = None, config_dir:
         )
         method = {**content["method"], "failed": {run.seed: run.reason for run in runs if not run.finished}}
         check_method(method)
-        curriculum = Curriculum.from_json(content["curriculum"])
+        if of_track is None and method["track"] is not None:
+            of_track = track(method["track"], config_dir)
+        curriculum = _curriculum(content["curriculum"], of_track)
     absent = [log_name(run.run) for run in runs if not (path / log_name(run.run)).is_file()]
     require((not absent, f"{path} lacks {listed(absent)}, which {SUBMISSION} names"))
-    if of_track is None and method["track"] is not None:
-        of_track = track(method["track"], config_dir)
     return Submission(
         path=path,
         method=method,
@@ -239,6 +244,24 @@ def read_submission(path: Path | str, of_track: Track | None = None, config_dir:
         track=of_track,
         digest=hashlib.sha256(data).hexdigest(),
     )
+
+
+def _curriculum(content: ReadOnlyValues, of_track: Track | None) -> Curriculum:
+    """Return what runs learned; where tasks are no CT-graphs, our own object of the same fingerprint.
+
+    Such a task makes its environment, which may do anything with the arguments of a stranger.
+    """
+    tasks = content.get("tasks")
+    if not isinstance(tasks, list) or not any(isinstance(task, dict) and "type" in task for task in tasks):
+        return Curriculum.from_json(content)
+    known = [curriculum_named(str(content.get("name")))] if of_track is None else []
+    for variant in () if of_track is None else of_track.variants:
+        known.append(variant.curriculum)
+    same = [curriculum for curriculum in known if curriculum.fingerprint == content.get("fingerprint")]
+    where = "published" if of_track is None else f"of track {of_track.id}"
+    message = f"curriculum has tasks that are no CT-graphs, and is not {where}: its environments are not made"
+    require((bool(same), message))
+    return same[0]
 
 
 def _check_fields(given: Any, fields: Mapping[str, Field], what: str, owner: str = "") -> None:
@@ -290,6 +313,8 @@ def experts_of(log: RunLog) -> list[NamedValues]:
     for each in said:
         numbered = isinstance(each, dict) and is_int(each.get("task"), 1)
         require((numbered, "the log names experts without the numbers of their tasks: restore it"))
+    twice = repeated(each["task"] for each in said)
+    require((not twice, f"the log names two experts of task {listed(twice)}: restore it"))
     return said
 
 
@@ -299,20 +324,25 @@ def packed(content: bytes) -> bytes:
 
 
 def read_log(path: Path) -> RunLog:
-    """Read a log of a submission; no more of it is unpacked than a log may have.
+    """Read a log of a submission; see `unpacked` for errors, which may also be those of `RunLog.of_content`."""
+    return RunLog.of_content(unpacked(path, MOST_BYTES_OF_A_LOG), path)
+
+
+def unpacked(path: Path, most: int) -> bytes:
+    """Return the content of a submitted log; no more than ``most`` bytes of it are unpacked.
 
     Raises:
-        ValueError: if it is no log, or larger than a log may be.
+        ValueError: if it is no file of gzip, or larger.
         OSError: if it cannot be read.
     """
     with named(path):
         data = read_regular(path, MOST_BYTES_OF_A_LOG)
         try:
-            content = gzip.GzipFile(fileobj=BytesIO(data)).read(MOST_BYTES_OF_A_LOG + 1)
+            content = gzip.GzipFile(fileobj=BytesIO(data)).read(most + 1)
         except (EOFError, OSError, zlib.error) as error:
             raise ValueError(f"is no file of gzip: {error}; restore it") from None
-        require((len(content) <= MOST_BYTES_OF_A_LOG, f"holds more than {MOST_BYTES_OF_A_LOG:,} bytes, the limit"))
-    return RunLog.of_content(content, path)
+        require((len(content) <= most, f"holds more than {most:,} bytes, the limit"))
+    return content
 
 
 def log_sum(log: RunLog) -> str:

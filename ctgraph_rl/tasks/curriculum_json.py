@@ -28,7 +28,7 @@ from ctgraph_rl.disk import write_whole
 from ctgraph_rl.strict import json_object, within
 from ctgraph_rl.tasks.images import IMAGE_SETS
 from ctgraph_rl.tasks.kinds.frozen_arguments import DictArgument, TupleArgument, from_json
-from ctgraph_rl.tasks.kinds.gym_task import GymTask
+from ctgraph_rl.tasks.kinds.gym_task import GymTask, require_wrapper_classes
 from ctgraph_rl.tasks.kinds.task_like import TaskLike, is_kind
 from ctgraph_rl.tasks.memory import bank_bytes
 from ctgraph_rl.tasks.observations import Observations
@@ -230,6 +230,8 @@ def _task(content: Any) -> TaskLike:
     unknown = [name for name in missing if name.partition(".")[0] not in known]
     fix = "import them first, as nothing of a file is imported"
     require((not unknown, f"the task needs the modules {', '.join(unknown)}: {fix}"))
+    if isinstance(task, GymTask):
+        require_wrapper_classes(task)
     return task
 
 

@@ -315,3 +315,24 @@ def _frozen_wrapper(wrapper: Any, rule: str) -> Any:
     require((found, f"the wrapper {name} has no name by which another process finds it, got {wrapper!r}: {fix}"))
     arguments = by_name(f"arguments of the wrapper {name}", given)
     return (name, arguments) if arguments else name
+
+
+def require_wrapper_classes(task: GymTask) -> None:
+    """Refuse wrappers that a file of others must not name: functions, and classes that write files or open windows.
+
+    Raises:
+        ValueError: for a wrapper that is no class of `gymnasium.Wrapper`, or one of `gymnasium.wrappers` that writes.
+    """
+    from gymnasium import Wrapper
+    from gymnasium.wrappers import HumanRendering, RecordVideo
+
+    for wrapper in task.wrappers:
+        name = wrapper if isinstance(wrapper, str) else wrapper[0]
+        try:
+            kind = load_object(name)
+        except (ImportError, AttributeError) as error:
+            raise ValueError(f"the wrapper {name} cannot be found: {error}") from error
+        is_class = isinstance(kind, type) and issubclass(kind, Wrapper)
+        allowed = is_class and not issubclass(kind, (RecordVideo, HumanRendering))
+        fix = "give the curriculum as Python"
+        require((allowed, f"a file may name only classes of gymnasium.Wrapper that write nothing, got {name}: {fix}"))
