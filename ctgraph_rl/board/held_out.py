@@ -7,7 +7,7 @@ submitted ones: are they lower than chance explains?
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,13 +30,7 @@ HELD_OUT = LEVELS[2]
 
 
 def seeds_of(submission: Submission, number: int, count: int) -> tuple[int, ...]:
-    """Return the seeds that a verifier's number draws: by the rule of the track, or from `HELD_OUT_SEEDS`.
-
-    Args:
-        submission: for which.
-        number: of the verifier, >= 0.
-        count: how many, >= 1.
-    """
+    """Return the seeds that a verifier's number draws: by the rule of the track, or from `HELD_OUT_SEEDS`."""
     if submission.track is not None:
         return submission.track.draw_held_out_seeds(submission.digest, number, count)
     return held_out_seeds(f"{submission.digest} {number}", count)
@@ -45,11 +39,7 @@ def seeds_of(submission: Submission, number: int, count: int) -> tuple[int, ...]
 def held_out_cells(submission: Submission, number: int, count: int, folder: Path) -> list[RerunCell]:
     """Return what is learned: a seed each, with other images and goals, and the submitted configuration.
 
-    Args:
-        submission: with the configuration.
-        number: of the verifier, >= 0.
-        count: how many seeds, >= 1.
-        folder: where each process has a folder, with the file of its curriculum.
+    Each has a folder within ``folder``, with the file of its curriculum.
     """
     cells = []
     first = submission.finished[0]
@@ -63,12 +53,7 @@ def held_out_cells(submission: Submission, number: int, count: int, folder: Path
 
 
 def held_out_checks(submission: Submission, results: Sequence[tuple[RerunCell, Rerun]]) -> Iterator[Check]:
-    """Yield a check for each run that failed, those of the protocol of the others, and that of their scores.
-
-    Args:
-        submission: with the submitted scores.
-        results: of each seed.
-    """
+    """Yield a check for each run that failed, those of the protocol of the others, and that of their scores."""
     name = score_name(submission)
     found = []
     for cell, result in results:
@@ -142,15 +127,11 @@ def renamed(path: tuple[int, ...], branching_factor: int, key: str) -> tuple[int
         branching_factor: b.
         key: decides the new names.
     """
+    branches = range(1, branching_factor + 1)
     new = []
     for place, decision in enumerate(path):
-        new.append(_names(path[:place], branching_factor, key)[decision])
+        text = f"{key} branches {'.'.join(map(str, path[:place]))}"
+        digests = {branch: hashlib.sha256(f"{text} {branch}".encode()).digest() for branch in branches}
+        order = sorted(branches, key=digests.__getitem__)
+        new.append(order[decision - 1])
     return tuple(new)
-
-
-def _names(before: tuple[int, ...], branching_factor: int, key: str) -> Mapping[int, int]:
-    """Return the new name of each branch of the node behind some decisions."""
-    branches = range(1, branching_factor + 1)
-    text = f"{key} branches {'.'.join(map(str, before))}"
-    order = sorted(branches, key=lambda branch: hashlib.sha256(f"{text} {branch}".encode()).digest())
-    return dict(zip(branches, order, strict=True))

@@ -396,15 +396,9 @@ def confined(
     filtering: int,
     graphics: bool = False,
 ) -> list[str]:
-    """Return the command that runs another one inside.
+    """Return the command that runs another one inside; see `run_isolated` for its arguments.
 
-    Args:
-        command: the other one.
-        folder: an absolute path, the only folder that it may change; its working directory.
-        paths: folders that it may read beside the system's and Python's.
-        variables: of its environment, beside `KEPT`.
-        filtering: the open file of `system_calls`.
-        graphics: whether it may use the graphics cards.
+    ``filtering`` is the open file of `system_calls`.
 
     Raises:
         ValueError: for a path that would show all files.

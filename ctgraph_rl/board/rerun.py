@@ -93,13 +93,7 @@ class Rerun(NamedTuple):
 
 
 def draw(submission: Submission, number: int, count: int) -> tuple[SubmittedRun, ...]:
-    """Return the runs that a verifier's number draws, without replacement; failed runs are drawn as others are.
-
-    Args:
-        submission: of which.
-        number: of the verifier, >= 0.
-        count: how many; all, if there are fewer.
-    """
+    """Return the runs that a verifier's number draws, all if there are fewer; failed runs are drawn as others are."""
 
     def place(run: SubmittedRun) -> bytes:
         return hashlib.sha256(f"{submission.digest} {number} {run.run}".encode()).digest()
@@ -108,13 +102,7 @@ def draw(submission: Submission, number: int, count: int) -> tuple[SubmittedRun,
 
 
 def cells_of(submission: Submission, drawn: Sequence[SubmittedRun], folder: Path) -> list[RerunCell]:
-    """Return what is learned again for drawn runs: each group of seeds once.
-
-    Args:
-        submission: of the runs.
-        drawn: the runs.
-        folder: where each process has a folder.
-    """
+    """Return what is learned again for drawn runs: each group of seeds once, in a folder within ``folder``."""
     cells = []
     groups = split_by(submission.runs, lambda run: run.seeds)
     for seeds in split_by(drawn, lambda run: run.seeds):
@@ -160,11 +148,7 @@ def job_of(
 def learn_again(cell: RerunCell, limits: Limits, isolated: Isolation, code: Sequence[Path] = ()) -> Outcome:
     """Learn a cell in a separate process; one that was stopped before is resumed where its learner can be.
 
-    Args:
-        cell: what to learn.
-        limits: of the process.
-        isolated: how it is closed off.
-        code: folders with the code of others.
+    Modules of others are looked for in ``code``.
     """
     made_folder(cell.folder)
     if cell.is_finished:
@@ -268,12 +252,6 @@ def checks_of(run: SubmittedRun, submitted: RunLog, result: Rerun, experts: Sequ
 
     A run that cannot be finished here, and a failed one that does not fail by itself, decide nothing: the machine or a
     limit may be why.
-
-    Args:
-        run: the submitted run.
-        submitted: its log.
-        result: of the same seed.
-        experts: the submitted logs of its single-task experts.
     """
     if not run.finished:
         again = True if result.failed_alone else None
@@ -309,11 +287,7 @@ def score_name(submission: Submission) -> str:
 
 
 def score_of(log: RunLog, curriculum: Curriculum, name: str) -> float | None:
-    """Return a metric of a log; None where it has no value.
-
-    Raises:
-        ValueError: for the log of another curriculum.
-    """
+    """Return a metric of a log, None where it has no value; raises ValueError for the log of another curriculum."""
     return scores(log, curriculum)[name].value
 
 

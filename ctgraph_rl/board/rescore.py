@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from ctgraph_rl.board.method_yaml import fact_rules, facts_of, track_version
 from ctgraph_rl.board.submission import Submission, SubmittedRun, experts_of, log_sum
-from ctgraph_rl.board.tracks import Track
+from ctgraph_rl.board.tracks import TUNING_SEEDS, Track
 from ctgraph_rl.checks import ReadOnlyValues, Rule, require
 from ctgraph_rl.learn.evaluate import Evaluator
 from ctgraph_rl.log.escape import listed
@@ -200,20 +200,14 @@ def curriculum_rule(curriculum: Curriculum, of_track: Track | None) -> Rule:
 
 
 def seed_rules(seeds: Iterable[int], tuned: Iterable[int], of_track: Track | None) -> list[Rule]:
-    """Return the rules that the seeds are those of the track, and that none was used for tuning.
-
-    Args:
-        seeds: of the runs.
-        tuned: seeds that the method says it was tuned on.
-        of_track: the track; None: any seeds that were not used for tuning.
-    """
+    """Return the rules that the seeds are those of the track, if there is one, and that none was used for tuning."""
     own = set(seeds)
     used = own & set(tuned)
     rules = [(not used, f"seeds {listed(sorted(used))} are among tuning.seeds: submit runs of other seeds")]
     if of_track is None:
         return rules
     wanted = set(of_track.seeds)
-    reserved = own & set(of_track.tuning_seeds)
+    reserved = own & set(TUNING_SEEDS)
     missing = wanted - own
     others = own - wanted - reserved
     asked = f"track {of_track.id} has seeds {_ranges(wanted)}"

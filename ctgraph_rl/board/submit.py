@@ -232,12 +232,7 @@ def _code_now(about: ReadOnlyValues) -> NamedValues:
 
 
 def failure_rules(runs: Sequence[Run], reasons: Mapping[int, str]) -> Iterator[Rule]:
-    """Yield the rules that every run is finished and whole, or accounted for.
-
-    Args:
-        runs: the runs.
-        reasons: why runs failed or were stopped, by seed.
-    """
+    """Yield the rules that every run is finished and whole, or has a reason by its seed."""
     for run in runs:
         known = run.seed in reasons
         fix = f"finish it, or account for it: failed: {{{run.seed}: why}} in method.yaml"

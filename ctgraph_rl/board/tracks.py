@@ -73,16 +73,16 @@ class Variant:
 
 @dataclass(frozen=True)
 class Track:
-    """A track.
+    """A track, as its file in ``conf/track`` says it.
 
     Args:
-        name: of its file in ``conf/track``.
+        name: of the file.
         version: rises with every change that makes results incomparable.
         title: for readers.
-        measures: what it measures, a sentence.
-        breakthrough: a result that would be one, a sentence.
+        measures: a sentence.
+        breakthrough: a sentence.
         score: name of the metric that orders a table.
-        seeds: of a submission, all of them.
+        seeds: of a submission.
         rungs: settings of each rung of a ladder; one without settings for a track of one curriculum.
         less_given: changes of the protocol for learners that are given less.
         config_dir: where its file is, if it is not one of ours.
@@ -103,21 +103,6 @@ class Track:
     def id(self) -> str:
         """Name and version, such as ``small-v1``."""
         return f"{self.name}-v{self.version}"
-
-    @property
-    def tuning_seeds(self) -> range:
-        """Seeds on which hyperparameters may be chosen."""
-        return TUNING_SEEDS
-
-    @property
-    def held_out_seeds(self) -> range:
-        """Seeds that a verifier draws from; see `draw_held_out_seeds`."""
-        return HELD_OUT_SEEDS
-
-    @property
-    def settings(self) -> tuple[str, ...]:
-        """The settings of its first variant, as on the command line."""
-        return f"{GROUP}={self.name}", *self.rungs[0]
 
     @cached_property
     def variants(self) -> tuple[Variant, ...]:
@@ -150,11 +135,6 @@ class Track:
 
         Neither the submitter, who does not know the number, nor the verifier, who does not choose the digest, can pick
         them.
-
-        Args:
-            digest: of the submission.
-            number: of the verifier, >= 0.
-            count: how many seeds, >= 1.
         """
         require((is_int(number, 0), f"number must be an integer >= 0, got {number!r}"), *at_least_one(count=count))
         return held_out_seeds(f"{self.id} {digest} {number}", count)
@@ -190,12 +170,7 @@ def held_out_seeds(key: str, count: int) -> tuple[int, ...]:
 
 
 def given(protocol: Protocol, blocks: int) -> str:
-    """Return in words what a learner is given to know of the tasks that it learns.
-
-    Args:
-        protocol: of the curriculum.
-        blocks: how many the curriculum has; between several there are boundaries.
-    """
+    """Return what a learner is given to know of tasks, in words; there are boundaries between several blocks."""
     parts = {"one_hot": ["task ids"], "at_boundaries": ["task ids at boundaries"], "hidden": []}[protocol.task_id]
     if blocks > 1 and protocol.announces and protocol.task_id != "at_boundaries":
         parts.append("boundaries")
@@ -205,11 +180,7 @@ def given(protocol: Protocol, blocks: int) -> str:
 
 
 def track(name: str, config_dir: Path | None = None) -> Track:
-    """Return a track by name.
-
-    Args:
-        name: of a file in ``conf/track``.
-        config_dir: a directory with tracks of the user, ``track/NAME.yaml``, which come first.
+    """Return a track by name; those of the user, ``track/NAME.yaml`` in ``config_dir``, come first.
 
     Raises:
         ValueError: for an unknown name, with the one that was probably meant, and for a file that lacks a part.

@@ -94,7 +94,7 @@ def planned(submission: Submission, arguments: argparse.Namespace) -> Plan:
     fresh: list[RerunCell] = []
     if arguments.level == HELD_OUT:
         fresh = held_out_cells(submission, number, enough, folder / HELD_OUT)
-    limits = most_limits([*reruns, *fresh], arguments)
+    limits = limits_of(longest([*reruns, *fresh]), arguments)
     isolated = isolation(folder, limits, graphics=submission.config.get("device", "cpu") != "cpu")
     why_not = isolated.why_not
     require((why_not is None, f"the code of others is not run: {why_not}; --level {RESCORED} runs none"))
@@ -109,9 +109,9 @@ def limits_of(cell: RerunCell, arguments: argparse.Namespace) -> Limits:
     return Limits(seconds, round(arguments.memory * GB), round(arguments.disk * GB), cell.job.num_threads)
 
 
-def most_limits(cells: Sequence[RerunCell], arguments: argparse.Namespace) -> Limits:
-    """Return the limits of the longest process."""
-    return limits_of(max(cells, key=lambda cell: cell.seconds), arguments)
+def longest(cells: Sequence[RerunCell]) -> RerunCell:
+    """Return what takes longest by the submitted times."""
+    return max(cells, key=lambda cell: cell.seconds)
 
 
 def describe_plan(plan: Plan) -> list[str]:
@@ -124,8 +124,8 @@ def describe_plan(plan: Plan) -> list[str]:
         seeds += f"; {HELD_OUT} seeds {_seeds(plan.held_out)}"
     seconds = sum(cell.seconds for cell in cells)
     frames = sum(cell.num_frames for cell in cells)
-    longest = _time(most_limits(cells, arguments).seconds)
-    most = f"each at most {longest}, {arguments.memory:g} GB of memory and {arguments.disk:g} GB of disk"
+    limit = _time(limits_of(longest(cells), arguments).seconds)
+    most = f"each at most {limit}, {arguments.memory:g} GB of memory and {arguments.disk:g} GB of disk"
     count = f"{len(cells)} process{'es' * (len(cells) > 1)}"
     found_in = "" if arguments.code is None else f", also looked for in {arguments.code}"
     lines = [
@@ -233,13 +233,7 @@ def level_of(checks: Sequence[Check]) -> str:
 
 
 def write_verification(submission: Submission, checks: Sequence[Check], plan: Plan | None = None) -> Path:
-    """Write ``verification.json`` into the folder of a submission; an earlier one is replaced.
-
-    Args:
-        submission: what was verified.
-        checks: of all levels.
-        plan: what was run; None if only files were checked.
-    """
+    """Write ``verification.json`` into the folder of a submission; without a plan only files were checked."""
     drawn: list[str] = []
     seeds: list[int] = []
     for cell in () if plan is None else plan.cells:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from yaml_settings import ALONE, escaped
 
 from ctgraph_rl.board.standings.track_ceilings import Ceilings, ceilings_of
-from ctgraph_rl.board.tracks import Track, Variant, tracks
+from ctgraph_rl.board.tracks import HELD_OUT_SEEDS, TUNING_SEEDS, Track, Variant, tracks
 
 COLUMNS = {
     "optimal": "optimum",
@@ -39,7 +39,7 @@ def track_cards() -> Iterator[tuple[str, str]]:
 
 def _card(track: Track) -> str:
     seeds = f"{track.seeds[0]} to {track.seeds[-1]}"
-    tuning = f"{track.tuning_seeds[0]} to {track.tuning_seeds[-1]}"
+    tuning = f"{TUNING_SEEDS[0]} to {TUNING_SEEDS[-1]}"
     names = dict.fromkeys(variant.curriculum.name for variant in track.variants)
     facts = {
         "curriculum": ", ".join(
@@ -48,7 +48,7 @@ def _card(track: Track) -> str:
         "score": f"`{track.score}`",
         "seeds of a submission": seeds,
         "seeds for tuning": tuning,
-        "seeds that verifiers draw from": f"{track.held_out_seeds[0]:,} to {track.held_out_seeds[-1]:,}",
+        "seeds that verifiers draw from": f"{HELD_OUT_SEEDS[0]:,} to {HELD_OUT_SEEDS[-1]:,}",
     }
     which = "every rung as the track gives it" if len(track.rungs) > 1 else "the first one"
     parts = [

@@ -6,7 +6,7 @@ import pytest
 from helpers.sweeping import command_line
 
 import curricula
-from ctgraph_rl.board.tracks import track, tracks
+from ctgraph_rl.board.tracks import HELD_OUT_SEEDS, TUNING_SEEDS, track, tracks
 from ctgraph_rl.metrics import METRICS
 from ctgraph_rl.runs.config import composed, plain
 from ctgraph_rl.runs.settings import digest
@@ -28,8 +28,8 @@ def test_a_track_has_seeds_for_submissions_for_tuning_and_for_verifiers_apart_fr
 
     drawn = found.draw_held_out_seeds("0a1b", number=7, count=5)
 
-    assert len({*found.seeds, *found.tuning_seeds, *drawn}) == len(found.seeds) + len(found.tuning_seeds) + 5
-    assert all(seed in found.held_out_seeds for seed in drawn)
+    assert len({*found.seeds, *TUNING_SEEDS, *drawn}) == len(found.seeds) + len(TUNING_SEEDS) + 5
+    assert all(seed in HELD_OUT_SEEDS for seed in drawn)
     assert found.score in METRICS
 
 
