@@ -247,9 +247,9 @@ def read_submission(path: Path | str, of_track: Track | None = None, config_dir:
 
 
 def _curriculum(content: ReadOnlyValues, of_track: Track | None) -> Curriculum:
-    """Return what runs learned; where tasks are no CT-graphs, our own object of the same fingerprint.
+    """Return what runs learned. Of tasks that are no CT-graphs, return our own curriculum of the same fingerprint.
 
-    Such a task makes an environment, and a stranger's arguments could ask it for any memory.
+    Making their environments with arguments from a file could take any memory.
     """
     tasks = content.get("tasks")
     if not isinstance(tasks, list) or not any(isinstance(task, dict) and "type" in task for task in tasks):
