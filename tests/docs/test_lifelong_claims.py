@@ -178,7 +178,7 @@ NO_DATA = {
 
 @pytest.fixture(scope="module")
 def tables():
-    from studies.lifelong import mastered
+    from helpers import mastered
 
     return {name: mastered.Table(name) for name in reads.of}
 

@@ -125,7 +125,7 @@ def better(t, *agents, pairs=20):
 
 @pytest.fixture(scope="module")
 def by_agent():
-    from studies.lifelong import mastered
+    from helpers import mastered
 
     return mastered.ByAgent()
 

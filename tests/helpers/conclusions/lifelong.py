@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import torch
 from studies.lifelong.experiments import MASKS, eight
-from studies.lifelong.mastered import Table
 from studies.verdicts import ALPHA
 
 from ctgraph_rl.report.statistics import compare
 from helpers.conclusions.sentences import Sentences
+from helpers.mastered import Table
 
 says = Sentences()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from string import Template
 
 from ctgraph_rl.report import statistics
-from studies.lifelong import comparison, mastered, pairs
+from studies.lifelong import comparison, pairs
 from studies.lifelong.experiments import EXPERIMENTS, MASKS, eight
 from studies.raw import HERE, TEMPLATES, machines, read
 from studies.verdicts import undecided
@@ -28,14 +28,14 @@ def differences() -> dict[str, str]:
     """What the page says of differences that the tests did not find."""
     found = {}
     for name in ("masks_ct8", "masks_ct12"):
-        areas = mastered.Table(name).compare_areas()
-        (one, other), each = mastered.clearest(areas)
+        areas = pairs.compare_areas(name)
+        (one, other), each = pairs.clearest(areas)
         found[f"{name}_clearest"] = f"{SHORT[one]} less {SHORT[other]}, {undecided(each, len(areas))}"
-    last = mastered.ByAgent().last_depth(LAST)
+    last = pairs.last_depth(LAST)
     found["last_depth"] = "; ".join(f"{SHORT[name]} {undecided(last[name], len(last))}" for name in LAST[:3])
     ends = statistics.corrected(pairs.against_finetuning(["ppo"]))
     deep = {name: each for name, each in ends.items() if name.startswith("fo_b1_depth2to5")}
-    name, each = mastered.clearest(deep)
+    name, each = pairs.clearest(deep)
     found["growing_clearest"] = f"{name.split(', ')[1]}, {undecided(each, len(ends))}"
     return found
 

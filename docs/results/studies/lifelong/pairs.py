@@ -8,17 +8,24 @@ seed. Five pairs have no p-value below 0.06, so pairs of several agents are test
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
+from itertools import combinations
+from typing import Any
 
 from ctgraph_rl import metrics
+from ctgraph_rl.metrics import MASTERED
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.statistics import Comparison
 from studies.lifelong import comparison
 from studies.lifelong.experiments import MASKS, expected
 from studies.raw import Raw, groups, mean_of, read, shown, table
+from studies.verdicts import ALPHA
 
 COMBINED, ALONE, OTHERS = ("mask_lc", "mask_blc"), "mask_ri", ("finetune", "ewc_published")
 BASE = "finetune"
+
+METHODS = ("finetune", "ewc_published", "mask_lc", "mask_ri", "mask_blc")
+"""Methods of the published comparison."""
 
 Measured = dict[tuple[str, ...], float]
 """A number of each run, by what tells pairs apart."""
@@ -47,6 +54,36 @@ def claims() -> dict[str, Comparison]:
     for mask in COMBINED:
         found[f"while learning, `{mask}` - `{ALONE}`"] = of_pairs(learning, mask, ALONE)
     return found
+
+
+def compare_areas(name: str) -> dict[tuple[str, str], Comparison]:
+    """Compare all pairs of methods of a table by the mean return over all blocks, p-values corrected for all."""
+    of = groups(read(name), "method", "seed")
+    areas: dict[str, list[float]] = {}
+    for (method, _), lines in sorted(of.items(), key=lambda cell: int(cell[0][1])):
+        areas.setdefault(method, []).append(while_learning(lines))
+    found = {}
+    for one, other in combinations(METHODS, 2):
+        found[one, other] = statistics.compare(areas[one], areas[other], bounds=(0, 1))
+    return statistics.corrected(found)
+
+
+def clearest(found: Mapping[Any, Comparison]) -> tuple[Any, Comparison]:
+    """Return the comparison with the smallest p-value of those that are above 0.05 after the correction."""
+    left = {pair: each for pair, each in found.items() if each.holm is not None and each.holm > ALPHA}
+    pair = min(left, key=lambda pair: left[pair].p_value or 1.0)
+    return pair, left[pair]
+
+
+def last_depth(methods: Sequence[str]) -> dict[str, Comparison]:
+    """Compare PPO with each method and fine-tuned PPO by depth 5 in its own block, p-values corrected for all."""
+    raw = [line for line in read("methods") if (line["curriculum"], line["agent"]) == ("fo_b1_depth2to5", "ppo")]
+    learned: dict[str, list[float]] = {}
+    for (method, _), lines in sorted(groups(raw, "method", "seed").items(), key=lambda cell: int(cell[0][1])):
+        last = comparison.curves(lines).ends[-1, -1]
+        learned.setdefault(method, []).append(float(last >= MASTERED))
+    found = {name: statistics.compare(learned[name], learned[BASE], bounds=(0, 1)) for name in methods}
+    return statistics.corrected(found)
 
 
 def over_curricula(measured: Mapping[tuple[str, ...], float]) -> Measured:

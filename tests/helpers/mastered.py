@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from itertools import combinations
-from typing import Any
+from collections.abc import Sequence
 
 import torch
-
-from ctgraph_rl.metrics import MASTERED, Curves
-from ctgraph_rl.report import statistics
 from studies.lifelong import comparison, pairs
 from studies.lifelong.experiments import expected
 from studies.raw import groups, read
 
-METHODS = ("finetune", "ewc_published", "mask_lc", "mask_ri", "mask_blc")
+from ctgraph_rl.metrics import MASTERED, Curves
+from ctgraph_rl.report import statistics
+
 GOALS = {
     "masks_ct8": ["000", "001", "010", "011", "100", "101", "110", "111"],
     "masks_ct12": ["00", "000", "01", "001", "10", "010", "11", "011", "100", "101", "110", "111"],
@@ -26,6 +23,7 @@ class Table:
     """The raw results of a comparison; runs of a method are in the order of their seeds."""
 
     def __init__(self, name: str):
+        self.name = name
         of = groups(read(name), "method", "seed")
         found = {(method, int(seed)): comparison.curves(lines) for (method, seed), lines in sorted(of.items())}
         self.curves = {who: [run for (other, _), run in found.items() if other == who] for who, _ in found}
@@ -59,13 +57,11 @@ class Table:
 
     def mean_areas(self) -> dict[str, float]:
         """The mean return of each method over all blocks."""
-        return {method: self.areas(method).mean().item() for method in METHODS}
+        return {method: self.areas(method).mean().item() for method in pairs.METHODS}
 
     def compare_areas(self) -> dict[tuple[str, str], statistics.Comparison]:
-        """All pairs of methods by the mean return over all blocks, their p-values corrected for all of them."""
-        of = {method: self.areas(method).mean(1).tolist() for method in METHODS}
-        pairs = combinations(METHODS, 2)
-        return statistics.corrected({(a, b): statistics.compare(of[a], of[b], bounds=(0, 1)) for a, b in pairs})
+        """All pairs of methods by the mean return over all blocks, as the page compares them."""
+        return pairs.compare_areas(self.name)
 
     def pairs_of_areas(self) -> dict[tuple[str, str], float | None]:
         """The corrected p-values of all pairs of methods by the mean return over all blocks."""
@@ -75,13 +71,6 @@ class Table:
     def p_value(first: torch.Tensor, second: torch.Tensor) -> float | None:
         """The p-value of the paired test of two methods, a number for each seed."""
         return statistics.compare(first.tolist(), second.tolist()).p_value
-
-
-def clearest(found: Mapping[Any, statistics.Comparison]) -> tuple[Any, statistics.Comparison]:
-    """The comparison with the smallest p-value of those that are not found: above 0.05 after the correction."""
-    left = {pair: each for pair, each in found.items() if each.holm is not None and each.holm > 0.05}
-    pair = min(left, key=lambda pair: left[pair].p_value or 1.0)
-    return pair, left[pair]
 
 
 class ByAgent:
@@ -108,12 +97,6 @@ class ByAgent:
     def against_finetuning(self, agents: Sequence[str]) -> dict[str, statistics.Comparison]:
         """Each method against fine-tuning with some agents on each curriculum."""
         return pairs.against_finetuning(agents)
-
-    def last_depth(self, methods: Sequence[str]) -> dict[str, statistics.Comparison]:
-        """PPO with each method less fine-tuned PPO by depth 5 in its own block, p-values corrected for all."""
-        of = {name: self.own("depth2to5", name, "ppo")[:, 3].double().tolist() for name in (*methods, "finetune")}
-        found = {name: statistics.compare(of[name], of["finetune"], bounds=(0, 1)) for name in methods}
-        return statistics.corrected(found)
 
     def keeps_and_finds(self, methods: Sequence[str]) -> tuple[bool, list[int]]:
         """Whether PPO with each method keeps all depths that it learned, and in how many seeds it learns the last."""
