@@ -156,6 +156,16 @@ def test_what_the_text_says_of_five_seeds_is_so():
     assert statistics.pairs_needed(1.0, 0.0, comparisons=10) == 9 and "Holm's correction need nine" in text
 
 
+def test_what_the_page_reads_aloud_is_a_number_of_the_results_and_what_more_seeds_give_is_so():
+    text = PAGE.read_text(encoding="utf-8")
+
+    adaptation = (CHECKOUT / "docs" / "results" / "adaptation.md").read_text(encoding="utf-8")
+    assert "PEARL is at the goal in 0.88 [0.42, 0.97] (5 seeds) of the episodes" in adaptation
+    assert "`0.88 [0.42, 0.97]` is a mean" in text and "may be anything from 42 % to 97 %" in text
+    for n, low in ((5, "0.48"), (20, "0.83")):
+        assert f"{statistics.mean([1.0] * n, bounds=(0, 1)).low:.2f}" == low and f"[{low}, 1]" in text
+
+
 def test_what_the_text_says_of_the_slippery_lake_is_so():
     lake = GymTask("FrozenLake-v1")
 

@@ -97,10 +97,10 @@ def verdicts(found: dict[str, dict[str, Score]]) -> str:
     for agent in found:
         seeds = max((score.n for score in found[agent].values()), default=0)
         only = [title for title in mean[agent] if title not in certain[agent]]
-        parts = [f"its interval is above the floor in {_listed(certain[agent])}"]
+        line = f"- **{AGENTS[agent]}** ({seeds} seeds) is above the floor in {_listed(certain[agent])}."
         if only:
-            parts.append(f"only its mean in {_listed(only)}")
-        lines.append(f"- **{AGENTS[agent]}** ({seeds} seeds): {'; '.join(parts)}.")
+            line += f" In {_listed(only)} only its mean is."
+        lines.append(line)
     return "\n".join(lines)
 
 
@@ -126,18 +126,21 @@ def page() -> str:
         rows.append([prop.title, *(str(by_title[prop.title]) for by_title in found.values())])
         absolute.append([prop.title, *(by_title[prop.title].absolute for by_title in found.values())])
     head = ["property", *(AGENTS[agent] for agent in found)]
-    gaps = []
+    gaps: dict[tuple[str, str], list[str]] = {}
     for agent, by_title in found.items():
         for title, score in by_title.items():
             if score.reason:
-                gaps.append(f"- {AGENTS[agent]}, {title}: {score.reason}.")
+                gaps.setdefault((title, score.reason), []).append(AGENTS[agent])
+    lines = []
+    for (title, reason), agents in gaps.items():
+        lines.append(f"- {title}: no score for {', '.join(agents)}. Reason: {reason}.")
     template = Template((TEMPLATES / "profile.md").read_text(encoding="utf-8"))
     return template.substitute(
         verdicts=verdicts(found),
         scores=table(head, rows),
         absolute=table(head, absolute),
         four_times=four_times(),
-        gaps="\n".join(dict.fromkeys(gaps)),
+        gaps="\n".join(lines),
         machines=machines(NAME),
     )
 

@@ -49,6 +49,22 @@ def test_what_the_page_says_of_each_agent_is_in_the_raw_results():
             assert (title in titles) == bool(found[agent][title].low)
 
 
+def test_what_is_read_aloud_is_the_score_of_lstm_ppo():
+    score = profile.scores()["lstm_ppo"]["memory"]
+
+    assert (str(score), score.n) == ("0.28 [0.00, 0.66]", 5)
+    assert "Read aloud, `0.28 [0.00, 0.66]` for memory: \"Over five seeds, LSTM-PPO comes 28 % of the way" in (
+        profile.PAGE.read_text(encoding="utf-8")
+    )
+
+
+def test_the_first_sentence_is_what_the_intervals_say():
+    certain = profile.above_floor(profile.scores(), certain=True)
+
+    assert certain == {"ppo": ["attention"], "lstm_ppo": ["attention"], "dqn": [], "rl2": []}
+    assert "PPO and LSTM-PPO are above the floor in attention." in profile.PAGE.read_text(encoding="utf-8")
+
+
 def test_an_agent_without_a_model_has_a_gap_and_no_score():
     reasons = {line["reason"] for line in profile.raw() if line["property"] == "model"}
 

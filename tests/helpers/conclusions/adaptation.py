@@ -43,7 +43,7 @@ def _() -> bool:
     return against(runs(2), ("pearl", "none"), ("pearl", "hard_straight_through")).wins == 3
 
 
-@says("**Three seeds cannot say whether a gate helps.**")
+@says("**Three seeds cannot say whether a gate helps**")
 def _() -> bool:
     of = runs(2)
     gates = [against(of, key, (key[0], "none")) for key in of if key[1] != "none"]
