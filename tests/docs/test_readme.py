@@ -45,6 +45,22 @@ def test_readme_is_short_and_counts_what_there_is():
     assert f"{len(metrics.definitions())} metrics, and runs" in text
 
 
+def test_the_page_on_how_numbers_were_made_has_the_file_of_each_result_of_readme():
+    folder = CHECKOUT / "docs" / "results"
+    page = (folder / "how_made.md").read_text(encoding="utf-8")
+    table = page.split("| in README |")[1].split("\n\n")[0]
+    rows = [line.strip("| ").split(" | ") for line in table.splitlines()[2:]]
+
+    text = " ".join(README.read_text(encoding="utf-8").replace("**", "").split())
+    results = text.split("## Results")[1].split("## More")[0]
+    for file, _, commit, numbers in rows:
+        assert (folder / re.findall(r"\((.*?)\)", file)[0]).is_file()
+        assert re.fullmatch(r"[0-9a-f]{8}", commit)
+        assert [each for each in numbers.split("; ") if each not in results and each != "the first figure"] == []
+    said = {number for *_, numbers in rows for number in re.findall(r"\d+ of \d+", numbers)}
+    assert {*re.findall(r"\d+ of \d+", results)} == said
+
+
 def test_every_example_with_stable_baselines3_sets_one_thread():
     """With all threads of a busy machine the same steps take ten times as long."""
     pages = [README, *(CHECKOUT / "docs").rglob("*.md")]

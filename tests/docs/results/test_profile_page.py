@@ -53,7 +53,7 @@ def test_what_is_read_aloud_is_the_score_of_lstm_ppo():
     score = profile.scores()["lstm_ppo"]["memory"]
 
     assert (str(score), score.n) == ("0.28 [0.00, 0.66]", 5)
-    assert "Read aloud, `0.28 [0.00, 0.66]` for memory: \"Over five seeds, LSTM-PPO comes 28 % of the way" in (
+    assert 'Read aloud, `0.28 [0.00, 0.66]` for memory: "Over five seeds, LSTM-PPO comes 28 % of the way' in (
         profile.PAGE.read_text(encoding="utf-8")
     )
 
