@@ -211,7 +211,7 @@ def test_the_share_of_frames_whose_episode_a_batch_cuts_off_is_that_of_simulated
         ages = edges - ends[ends.searchsorted(edges, side="right") - 1]
         shares.append(100 * np.minimum(ages, steps).mean() / steps)
 
-    part = PAGE.split("cuts off, at p = 0, 0.5 and 0.9, is ")[1].split("So REINFORCE")[0]
+    part = PAGE.split("continues, at p = 0, 0.5 and 0.9: ")[1].split("So REINFORCE")[0]
     said = re.search(rf"([\d, %and]+) with {steps}\b", part)[1]
 
     assert [float(each) for each in re.findall(r"\d+(?= %)", said)] == pytest.approx(shares, abs=0.7)

@@ -254,7 +254,7 @@ def test_cells_of_all_tables_were_run_again_and_only_those_of_the_earlier_revisi
     assert other_greedy == [("4", "2")]
     assert [line["equal"] for line in changed if (line["depth"], line["seed"]) == ("5", "1")] == ["2"], "the greedy two"
     assert len(changed) == 20 and "20 of 20 were run again" in HOW_MADE
-    assert "but for seed 2 of depth 4, which had not learned and now has, and seed 1 of depth 5" in HOW_MADE
+    assert "seed 2 of depth 4 had not learned and now has, and seed 1 of depth 5 is now right by chance" in HOW_MADE
 
 
 def of_seeds_together(of):

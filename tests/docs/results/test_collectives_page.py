@@ -187,9 +187,9 @@ def test_what_the_text_says_of_eight_epochs_holds():
 
     assert "With 8 epochs ({}, {} and {} seeds) the final".format(*seeds) in PAGE
     assert "return is {} with one learner, {} with 4 members and {} with 16".format(*numbers["final_return"]) in PAGE
-    assert f"from {mean(of_block[2]):.2f} in the second to {mean(of_block[16]):.2f} in the last" in PAGE
-    assert "had a reported return of {} with 4 members and {} with 16".format(*numbers["reported_return"]) in PAGE
-    assert "the next batch with them one of {} and {}".format(*numbers["obtained_return"]) in PAGE
+    assert f"from {mean(of_block[2]):.2f} in the second block to {mean(of_block[16]):.2f} in the last" in PAGE
+    assert "had a mean reported return of {} with 4 members and {} with 16".format(*numbers["reported_return"]) in PAGE
+    assert "The next batch with them had one of {} and {}".format(*numbers["obtained_return"]) in PAGE
 
 
 def of_mosaic(exchange: str, num_members: int, num_epochs: int = 1) -> list[dict[str, str]]:

@@ -85,7 +85,7 @@ def test_what_masks_end_with_and_what_labels_cost_is_computed_from_the_raw_resul
     )
 
     assert {line["final_returns"] for name in ("adwin", "announced") for line in masks[name]} == {"1 1 1 1"}
-    assert "end with a return of 1 on all goals in all five seeds, as masks with announced tasks do." in PAGE
+    assert "with a return of 1 on all goals in all five seeds. Masks with announced tasks end with the same." in PAGE
     assert end["swoks"] == end["swoks, fresh"]
     assert f"With SWOKS they end at {end['swoks']}, and fine-tuning at {end['none']}." in PAGE
     assert f"ADWIN's online return is {online['adwin']}, that with announced tasks {online['announced']}." in PAGE
@@ -146,7 +146,7 @@ def test_found_changes_and_other_alarms_are_counted_from_the_spans(made, masks):
     ends = {name: [float(line["average_performance"]) for line in masks[name]] for name in ("adwin", "swoks")}
     assert len(ends["adwin"]) == 5
     announced = [float(line["average_performance"]) for line in masks["announced"]]
-    adwin = f"ends at a mean return of {min(ends['adwin']):.2f} with the detector ADWIN, which watches the return"
+    adwin = f"ends at a mean return of {min(ends['adwin']):.2f} with the detector ADWIN"
     swoks = f"{sum(ends['swoks']) / 5:.2f} with the detector SWOKS (5 seeds)"
     assert f"{adwin}, {min(announced):.2f} with announced tasks, and {swoks}" in README
 
