@@ -13,7 +13,7 @@ from ctgraph_rl.log.escape import csv_text, markdown_table, markdown_text
 from ctgraph_rl.log.files import locked
 from ctgraph_rl.profile.scoring import Profiles, Score, profile_scores
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, Gallery, left_out
-from ctgraph_rl.report.latex import PREAMBLE, Table, TableCell, latex
+from ctgraph_rl.report.latex import Table, as_cell, document
 from ctgraph_rl.report.style import MOST_AGENTS, WIDTH, agent_style, new_figure, require_packages, short
 
 MEANING = (
@@ -44,7 +44,7 @@ def write_profile(paths: Sequence[Path | str], folder: Path | str, agents: Seque
     cells = []
     gaps = []
     for agent, of_agent in scores.items():
-        cells.append((agent, list(map(_cell, of_agent.values()))))
+        cells.append((agent, [as_cell(str(score)) for score in of_agent.values()]))
         for title, each in of_agent.items():
             rows.append((agent, title, *each))
             if each.reason:
@@ -55,7 +55,7 @@ def write_profile(paths: Sequence[Path | str], folder: Path | str, agents: Seque
     folder = made_folder(Path(folder))
     with locked(folder):
         write_whole(folder / "profile.csv", csv_text(rows))
-        write_whole(folder / "profile.tex", f"{PREAMBLE}\n\n{latex(table)}\n")
+        write_whole(folder / "profile.tex", document([table]) + "\n")
         [drawn] = Gallery(folder).write((), _figures(scores))  # which draws them in the report's style
         figure = f"![{drawn.alt}]({drawn.path})"
         page = ["# Profile", figure, drawn.caption, by_agent, "## What was measured", absolute, *gaps]
@@ -80,11 +80,6 @@ def text_table(scores: Profiles) -> str:
             why = f"  ({each.reason})" if each.reason else ""
             lines.append(f"  {title:16}  {each!s:17}  {each.absolute}{why}")
     return "\n".join(lines)
-
-
-def _cell(score: Score) -> TableCell:
-    value, _, interval = str(score).partition(" ")
-    return TableCell(value, interval)
 
 
 def _figures(scores: Profiles) -> Iterator[CaptionedFigure]:

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ctgraph_rl.log.escape import markdown_table, markdown_text, terminal_text
 from ctgraph_rl.parsers import TABLE_FORMATS
-from ctgraph_rl.report.latex import PREAMBLE, Labels, Table, TableCell, TableRows
-from ctgraph_rl.report.latex import latex as latex_table
+from ctgraph_rl.report.latex import Table, TableCell, as_cell, document
 from ctgraph_rl.runs.read import split_by
 
 if TYPE_CHECKING:
@@ -71,14 +70,10 @@ def markdown(rows: Sequence[Row], modified: Modified = NOT_MODIFIED, legend: str
 
 def latex(rows: Sequence[Row], modified: Modified = NOT_MODIFIED, legend: str = LEGEND) -> str:
     """Return a table of agents and measures in LaTeX for each curriculum; see `ctgraph_rl.report.latex`."""
-    labels = Labels()
-    parts = [PREAMBLE]
-    for each in matrices(rows):
-        parts.append(as_latex(each, labels, modified.get(each.curriculum), legend))
-    return "\n\n".join(parts)
+    return document(matrices(rows, modified, legend))
 
 
-def matrices(rows: Sequence[Row]) -> Iterator[Matrix]:
+def matrices(rows: Sequence[Row], modified: Modified = NOT_MODIFIED, legend: str = LEGEND) -> Iterator[Table]:
     """Return the table of agents and measures of each curriculum; the first column is the agents' number of seeds."""
     for curriculum, its in split_by(rows, lambda row: row.curriculum).items():
         notes = _notes(its)
@@ -90,9 +85,12 @@ def matrices(rows: Sequence[Row]) -> Iterator[Matrix]:
             most = max(own, key=lambda row: row.estimate.n)
             for row in own:
                 if row.measure in cells:
-                    cells[row.measure] = _as_cell(row, notes)
+                    cells[row.measure] = as_cell(row.estimate.shown, notes.index(row.note) + 1 if row.note else 0)
             lines.append((agent, [TableCell(most.estimate.seeds), *cells.values()]))
-        yield Matrix(curriculum, ("n", *map(measure_name, measures)), lines, notes)
+        what = f" Modified: {modified[curriculum]}." if curriculum in modified else ""
+        caption = f"{curriculum}: {legend}; n: seeds with a value / seeds expected.{what}"
+        head = ("n", *map(measure_name, measures))
+        yield Table(caption, f"{curriculum} measures", "agent", head, rows=lines, notes=notes)
 
 
 def _notes(rows: Sequence[Row]) -> list[str]:
@@ -100,23 +98,9 @@ def _notes(rows: Sequence[Row]) -> list[str]:
     return list(dict.fromkeys(row.note for row in rows if row.note))
 
 
-def _as_cell(row: Row, notes: Sequence[str]) -> TableCell:
-    """Return a row as a cell of the table of agents and measures."""
-    value, _, interval = row.estimate.shown.partition(" ")
-    return TableCell(value, interval, notes.index(row.note) + 1 if row.note else 0)
-
-
 def measure_name(measure: str) -> str:
     """Return the one name of a measure for readers, such as ``average performance``."""
     return measure.replace("_", " ")
-
-
-def as_latex(matrix: Matrix, labels: Labels, modified: str | None = None, legend: str = LEGEND) -> str:
-    """Return the table of agents and measures of a curriculum in LaTeX."""
-    what = f" Modified: {modified}." if modified else ""
-    caption = f"{matrix.curriculum}: {legend}; n: seeds with a value / seeds expected.{what}"
-    label = labels.new(matrix.curriculum, "measures")
-    return latex_table(Table(caption, label, "agent", matrix.head, rows=matrix.rows, notes=matrix.notes))
 
 
 FORMATS: dict[str, Callable[[Sequence[Row], Modified, str], str]] = dict(
@@ -135,15 +119,6 @@ class Line(NamedTuple):
     value: str
     n: str
     mark: str  # number of its note, or nothing
-
-
-class Matrix(NamedTuple):
-    """Agents by measures of a curriculum: headings, each agent with its cells, and notes by their numbers, from 1."""
-
-    curriculum: str
-    head: Sequence[str]
-    rows: TableRows
-    notes: Sequence[str]
 
 
 class Page(NamedTuple):

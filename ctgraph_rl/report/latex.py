@@ -8,7 +8,8 @@ several tables. A part that is still wider than a line, as for long names, is sc
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+import textwrap
+from collections.abc import Iterable, Sequence
 from string import ascii_lowercase
 from typing import NamedTuple
 
@@ -42,6 +43,15 @@ class TableCell(NamedTuple):
     interval: str = ""
     note: int = 0
 
+    def __str__(self) -> str:
+        return f"{self.value} {self.interval}".strip()
+
+
+def as_cell(text: str, note: int = 0) -> TableCell:
+    """Return a value and its interval, such as ``0.50 [0.25, 0.75]``, as a cell."""
+    value, _, interval = text.partition(" ")
+    return TableCell(value, interval, note)
+
 
 TableRows = Sequence[tuple[str, Sequence[TableCell]]]
 """Rows with their names."""
@@ -57,83 +67,67 @@ class Table(NamedTuple):
     rows: TableRows
     notes: Sequence[str] = ()
 
+    @property
+    def texts(self) -> list[list[str]]:
+        """The rows as texts, each with its name."""
+        return [[name, *map(str, cells)] for name, cells in self.rows]
+
+
+def document(tables: Iterable[Table]) -> str:
+    """Return tables in LaTeX, each with its own label."""
+    labels = Labels()
+    return "\n\n".join([PREAMBLE, *(latex(table._replace(label=labels.new(table.label))) for table in tables)])
+
 
 def latex(table: Table) -> str:
     """Return a table in LaTeX, or several where it is long."""
-    columns = _columns(table)
-    parts = [(start, min(start + columns, len(table.head))) for start in range(0, max(len(table.head), 1), columns)]
-    most = max(1, MOST_LINES // (2 * len(parts)))
+    widest = max([len(table.first), *(len(name) for name, _ in table.rows)])
+    columns = max(2, int((LINE_WIDTH - LETTER * widest) // (COLUMN + COLUMN_SEPARATION)))
+    starts = range(0, max(len(table.head), 1), columns)
+    most = max(1, MOST_LINES // (2 * len(starts)))
     floats: list[str] = []
-    for start in range(0, max(len(table.rows), 1), most):
-        floats.append(_float(table, table.rows[start : start + most], parts, len(floats) + 1))
+    for first in range(0, max(len(table.rows), 1), most):
+        rows = table.rows[first : first + most]
+        caption = latex_text(f"{table.caption} (part {len(floats) + 1})" if floats else table.caption)
+        label = f"{table.label}-{len(floats) + 1}" if floats else table.label
+        used: set[int] = set()
+        for _, cells in rows:
+            used.update(cell.note for cell in cells)
+        notes = []
+        for i in sorted(used - {0}):
+            note = latex_text(table.notes[i - 1])
+            notes.append(rf"\par\smallskip\raggedright\textsuperscript{{{letters(i)}}} {note}")
+        head = [r"\begin{table}[htbp]", r"\centering", r"\setlength{\belowcaptionskip}{6pt}", rf"\caption{{{caption}}}"]
+        head += [rf"\label{{tab:{label}}}", r"\footnotesize", r"\setlength{\tabcolsep}{4pt}"]
+        bodies = [_tabular(table, rows, start, start + columns) for start in starts]
+        floats.append("\n".join([*head, "\n\\par\\medskip\n".join(bodies), *notes, r"\end{table}"]))
     return "\n\n".join(floats)
 
 
-def _columns(table: Table) -> int:
-    """Return how many columns of numbers fit beside the names of the rows."""
-    names = max((len(name) for name, _ in table.rows), default=0)
-    room = LINE_WIDTH - LETTER * max(names, len(table.first))
-    return max(2, int(room // (COLUMN + COLUMN_SEPARATION)))
-
-
-def _float(table: Table, rows: TableRows, parts: Sequence[tuple[int, int]], number: int) -> str:
-    """Return one table with its parts."""
-    again = f" (part {number})" if number > 1 else ""
-    label = f"{table.label}-{number}" if number > 1 else table.label
-    used: set[int] = set()
-    for _, cells in rows:
-        used.update(cell.note for cell in cells)
-    notes = []
-    for i in sorted(used - {0}):
-        note = latex_text(table.notes[i - 1])
-        notes.append(rf"\par\smallskip\raggedright\textsuperscript{{{letters(i)}}} {note}")
-    bodies = [_tabular(table, rows, part) for part in parts]
-    head = [r"\begin{table}[htbp]", r"\centering", r"\setlength{\belowcaptionskip}{6pt}"]
-    head += [rf"\caption{{{latex_text(table.caption + again)}}}"]
-    head += [rf"\label{{tab:{label}}}", r"\footnotesize", r"\setlength{\tabcolsep}{4pt}"]
-    return "\n".join([*head, "\n\\par\\medskip\n".join(bodies), *notes, r"\end{table}"])
-
-
-def _tabular(table: Table, rows: TableRows, part: tuple[int, int]) -> str:
+def _tabular(table: Table, rows: TableRows, start: int, end: int) -> str:
     """Return some columns of a table, scaled down where they are wider than a line."""
-    start, end = part
     heads = [latex_text(table.first), *map(_heading, table.head[start:end])]
-    lines: list[str] = []
+    lines = [r"\sbox2{%", rf"\begin{{tabular}}{{@{{}}l{'r' * (len(heads) - 1)}@{{}}}}", r"\toprule"]
+    lines += [" & ".join(heads) + r" \\", r"\midrule"]
     for name, cells in rows:
-        lines += _lines(name, cells[start:end])
-    inner = [
-        rf"\begin{{tabular}}{{@{{}}l{'r' * (end - start)}@{{}}}}",
-        r"\toprule",
-        " & ".join(heads) + r" \\",
-        r"\midrule",
-    ]
-    inner += [*lines, r"\bottomrule", r"\end{tabular}%"]
-    fitted = r"\ifdim\wd2>\linewidth\resizebox{\linewidth}{!}{\usebox2}\else\usebox2\fi"
-    return "\n".join([r"\sbox2{%", *inner, "}%", fitted])
+        values = [latex_text(name)]
+        intervals = [""]
+        for cell in cells[start:end]:  # the letter of a note takes no room: decimal points stay below each other
+            mark = rf"\rlap{{\textsuperscript{{{letters(cell.note)}}}}}" if cell.note else ""
+            values.append(signed(cell.value) + mark)
+            intervals.append(rf"{{\scriptsize {signed(cell.interval)}}}" if cell.interval else "")
+        lines.append(" & ".join(values) + r" \\")
+        if any(intervals):
+            lines.append(" & ".join(intervals) + r" \\")
+    lines += [r"\bottomrule", r"\end{tabular}%", "}%"]
+    return "\n".join([*lines, r"\ifdim\wd2>\linewidth\resizebox{\linewidth}{!}{\usebox2}\else\usebox2\fi"])
 
 
 def _heading(name: str) -> str:
     """Return a heading of several lines, right-aligned as its column is."""
-    lines: list[str] = []
-    for word in name.split():
-        fits = lines and len(lines[-1]) + 1 + len(word) <= HEADING
-        lines[-1:] = [f"{lines[-1]} {word}"] if fits else [*lines[-1:], word]
-    shown = r" \\ ".join(map(latex_text, lines))
+    lines = [latex_text(line) for line in textwrap.wrap(name, HEADING, break_long_words=False, break_on_hyphens=False)]
+    shown = r" \\ ".join(lines)
     return shown if len(lines) < 2 else rf"\begin{{tabular}}[b]{{@{{}}r@{{}}}}{shown}\end{{tabular}}"
-
-
-def _lines(name: str, cells: Sequence[TableCell]) -> Iterator[str]:
-    """Yield the line of a row's values, and that of their intervals where there are any."""
-    yield " & ".join([latex_text(name), *map(_value, cells)]) + r" \\"
-    if any(cell.interval for cell in cells):
-        intervals = (rf"{{\scriptsize {signed(cell.interval)}}}" if cell.interval else "" for cell in cells)
-        yield " & ".join(["", *intervals]) + r" \\"
-
-
-def _value(cell: TableCell) -> str:
-    """Return a value; the letter of its note takes no room, so that decimal points stay below each other."""
-    mark = rf"\rlap{{\textsuperscript{{{letters(cell.note)}}}}}" if cell.note else ""
-    return signed(cell.value) + mark
 
 
 def signed(value: str) -> str:
@@ -143,7 +137,7 @@ def signed(value: str) -> str:
 
 
 def letters(number: int) -> str:
-    """Return the letters of a note, from 1: a to z, then aa; no number, which would be read as an exponent."""
+    """Return the letters of a note, from 1: a to z, then aa; a number would be read as an exponent."""
     rest, last = divmod(number - 1, len(ascii_lowercase))
     return (letters(rest) if rest else "") + ascii_lowercase[last]
 

@@ -22,7 +22,7 @@ from ctgraph_rl.report.figures.heatmaps import MOST_NAMES, transfer_maps
 from ctgraph_rl.report.figures.labels import label_strips
 from ctgraph_rl.report.figures.learning_curves import learning_curves, mean_curves, training_curves
 from ctgraph_rl.report.figures.trees import Trees, find_trees, task_trees
-from ctgraph_rl.report.latex import PREAMBLE, Labels, Table, TableCell, latex
+from ctgraph_rl.report.latex import Table, as_cell, document
 from ctgraph_rl.report.names import colours_of, displayed
 from ctgraph_rl.report.sections import Result, Section, sections
 from ctgraph_rl.report.style import MOST_AGENTS, require_packages, style
@@ -62,20 +62,12 @@ class Report(NamedTuple):
     problems: list[Problem]
 
 
-class Numbers(NamedTuple):
-    """A matrix as a table."""
-
-    title: str
-    head: TextRow
-    rows: list[TextRow]
-
-
 class AgentPart(NamedTuple):
     """The part of the page on an agent."""
 
     result: Result
     figures: list[Written]
-    numbers: list[Numbers]
+    numbers: dict[str, Table]  # matrices by their titles
     settings: list[tuple[str, Any]]
     sentences: list[str]
 
@@ -86,21 +78,13 @@ class Part(NamedTuple):
     section: Section
     facts: list[tuple[str, Any]]
     figures: list[Written]
-    matrix: formats.Matrix  # agents by the most important measures
+    matrix: Table  # agents by the most important measures
     table: formats.Page  # the same, a line each
     everything: formats.Page | None  # the table of every measure
     agents: list[AgentPart]
     unshown: int  # agents without figures
     runs: list[TextRow]
     systems: list[tuple[str, int]]  # where the runs ran, and how many
-
-    @property
-    def by_agent(self) -> tuple[TextRow, list[TextRow]]:
-        """The table of agents and measures as texts: its head and its rows."""
-        lines = []
-        for agent, cells in self.matrix.rows:
-            lines.append((agent, *(f"{cell.value} {cell.interval}".strip() for cell in cells)))
-        return ("agent", *self.matrix.head), lines
 
 
 def write_report(
@@ -138,22 +122,30 @@ def write_report(
         within = len(paths) == 1 and is_writable(paths[0])
         folder = made_folder(Path(paths[0]) / "report" if within else Path("report"))
     found = sections(runs, count)
-    most = _most_figures(found)
+    num_agents = sum(min(len(section.results), MOST_AGENTS) for section in found)
+    most = 1 + len(found) * len(OF_SECTION) + num_agents * len(OF_AGENT)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder):
         gallery = Gallery(folder, width, chosen, lambda done: count("figures", done, most))
         together = gallery.write((), map(experiments, [found]))  # drawn in the gallery's style
-        parts = []
-        missing: list[Run] = []
-        for section in found:
-            parts.append(_part(section, gallery))
-            missing += [run for run in section.runs if run.reason is not None]
+        parts = [_part(section, gallery) for section in found]
+        known: dict[str, tuple[str, str, str]] = {}
+        shown: dict[str, None] = {}
+        tables = []
+        for part in parts:
+            known |= part.section.definitions()
+            tables.append(part.matrix)
+            for agent in part.agents:
+                shown[agent.result.agent] = None
+                tables += agent.numbers.values() if len(part.section.labels) <= MOST_COLUMNS else ()
+        who = ", ".join(shown) if len(shown) <= 3 else f"{len(shown)} agents"
+        where = found[0].name if len(found) == 1 else f"{len(found)} curricula"
         page = folder / "report.html"
         for file in (page, page.with_suffix(".md")):
             text = rendered(
                 Path(__file__).with_name(f"{file.name}.j2"),
-                title=_title(parts),
+                title=f"{where}: {who}",
                 figures=together,
                 smallest="44rem" if width == "text" else "0",
                 parts=parts,
@@ -161,39 +153,25 @@ def write_report(
                 code=[*mixed_code(runs), *code_notes(runs), *label_notes(runs)],
                 legend=formats.LEGEND,
                 legend_of_means=formats.MEANS,
-                definitions=_definitions(parts),
+                definitions=[(name, which, formula, source) for which, (name, formula, source) in known.items()],
                 version=__version__,
-                missing=missing,
+                missing=[run for run in runs if run.reason is not None],
                 num_runs=len(runs),
             )
             write_whole(file, text)
-        write_whole(folder / "tables.tex", _latex(parts))
+        write_whole(folder / "tables.tex", document(tables) + "\n")
     return Report(page, runs, problems)
 
 
-def _most_figures(found: Sequence[Section]) -> int:
-    """Return the number of figures of a report, if none is left out."""
-    agents = sum(min(len(section.results), MOST_AGENTS) for section in found)
-    return 1 + len(found) * len(OF_SECTION) + agents * len(OF_AGENT)
-
-
-def _title(parts: Sequence[Part]) -> str:
-    """The curriculum and the agents as far as they fit, else how many there are."""
-    agents: dict[str, None] = {}
-    for part in parts:
-        agents |= dict.fromkeys(agent.result.agent for agent in part.agents)
-    who = ", ".join(agents) if len(agents) <= 3 else f"{len(agents)} agents"
-    where = parts[0].section.name if len(parts) == 1 else f"{len(parts)} curricula"
-    return f"{where}: {who}"
-
-
 def _part(section: Section, gallery: Gallery) -> Part:
+    shown = results.selected(section.rows)
+    modified = {section.name: section.modified} if section.modified else {}
     return Part(
         section,
         facts=list(facts(section)),
         figures=gallery.write((section.name,), (draw(section) for draw in OF_SECTION)),
-        matrix=next(formats.matrices(results.selected(section.rows))),
-        table=next(formats.pages(results.selected(section.rows))),
+        matrix=next(formats.matrices(shown, modified)),
+        table=next(formats.pages(shown)),
         everything=next(formats.pages(section.rows)) if len(section.rows) <= MOST_ROWS else None,
         agents=[_agent(section, result, gallery) for result in section.results[:MOST_AGENTS]],
         unshown=max(0, len(section.results) - MOST_AGENTS),
@@ -226,44 +204,41 @@ def facts(section: Section) -> Iterator[tuple[str, Any]]:
 
 
 def _agent(section: Section, result: Result, gallery: Gallery) -> AgentPart:
+    """Draw an agent's figures, and return its part with sentences on what is missing and why."""
     trees = find_trees(result.finished[0]) if result.finished else None
     drawn = () if trees is None else (draw(section, result, trees) for draw in OF_AGENT)
     figures = gallery.write((section.name, result.agent), drawn)
-    settings = list(result.runs[0].settings.items())
-    return AgentPart(result, figures, list(_numbers(section, result)), settings, list(_sentences(result, trees)))
-
-
-def _sentences(result: Result, trees: Trees | None) -> Iterator[str]:
-    """Return sentences on what is missing, and why."""
-    missing = []
-    for seed, run in result.by_seed.items():
-        if run is None:
-            missing.append(f"Seed {seed} has no run.")
-    for run in result.runs:
-        if run.reason is not None:
-            missing.append(f"Seed {run.seed} has no results: {run.reason}.")
-    yield from missing[:MOST_SENTENCES]
+    missing = [f"Seed {seed} has no run." for seed, run in result.by_seed.items() if run is None]
+    missing += [f"Seed {run.seed} has no results: {run.reason}." for run in result.runs if run.reason is not None]
+    sentences = missing[:MOST_SENTENCES]
     if len(missing) > MOST_SENTENCES:
-        yield f"{len(missing) - MOST_SENTENCES} more seeds have no results; the list of runs says why."
+        more = len(missing) - MOST_SENTENCES
+        sentences.append(f"{more} more seeds have no results; the list of runs says why.")
     if trees is not None and trees.reason:
         what = "Trees are" if trees.curriculum is None else "The policy on the trees is"
-        yield f"{what} missing: {trees.reason}."
+        sentences.append(f"{what} missing: {trees.reason}.")
+    settings = list(result.runs[0].settings.items())
+    return AgentPart(result, figures, _numbers(section, result), settings, sentences)
 
 
-def _numbers(section: Section, result: Result) -> Iterator[Numbers]:
-    """Both matrices with all intervals, where there are not too many tasks for a table."""
+def _numbers(section: Section, result: Result) -> dict[str, Table]:
+    """Both matrices with all intervals by their titles, where there are not too many tasks for a table."""
     if not result.finished or len(section.labels) > MOST_NAMES:
-        return
-    tables = (("Mean return after each block", result.performance(), 0), ("Change by each block", result.transfer(), 1))
-    for title, matrix, first in tables:
+        return {}
+    matrices = {"Mean return after each block": result.performance(), "Change by each block": result.transfer()}
+    tables = {}
+    for first, (title, matrix) in enumerate(matrices.items()):
         rows = []
         for block, estimates in enumerate(matrix, first):
-            row = [str(block)]
+            cells = []
             for estimate in estimates:
                 complete = estimate.n in (0, len(result.finished))
-                row.append(estimate.shown if complete else f"{estimate.shown} n = {estimate.n}")
-            rows.append(tuple(row))
-        yield Numbers(title, ("block", *section.labels), rows)
+                cells.append(as_cell(estimate.shown if complete else f"{estimate.shown} n = {estimate.n}"))
+            rows.append((str(block), cells))
+        caption = f"{section.name}, {result.agent} (n = {result.n}): {title}; {formats.MEANS}."
+        label = f"{section.name} {result.agent} {title}"
+        tables[title] = Table(caption, label, "block", section.labels, rows)
+    return tables
 
 
 def _runs(result: Result) -> Iterator[TextRow]:
@@ -285,34 +260,3 @@ def _system(run: Run) -> str:
     machine = run.about.get("machine", "not said")
     group = f"; trained in a group of {group_size(run)} seeds" if group_size(run) > 1 else ""
     return f"{versions or 'versions not said'}; machine {machine}, threads of torch {threads}, device {device}{group}"
-
-
-def _definitions(parts: Sequence[Part]) -> list[tuple[str, str, str, str]]:
-    """Measure, id, formula and source of every measure on the page."""
-    known: dict[str, tuple[str, str, str]] = {}
-    for part in parts:
-        known |= part.section.definitions()
-    return [(name, which, formula, source) for which, (name, formula, source) in known.items()]
-
-
-def _latex(parts: Sequence[Part]) -> str:
-    """Return tables for papers: the measures of each curriculum, and each agent's matrices."""
-    labels = Labels()
-    found = [PREAMBLE]
-    for part in parts:
-        found.append(formats.as_latex(part.matrix, labels, part.section.modified))
-        for agent in part.agents:
-            for numbers in agent.numbers if len(part.section.labels) <= MOST_COLUMNS else ():
-                who = f"{part.section.name}, {agent.result.agent} (n = {agent.result.n})"
-                label = labels.new(part.section.name, agent.result.agent, numbers.title)
-                caption = f"{who}: {numbers.title}; {formats.MEANS}."
-                found.append(latex(Table(caption, label, numbers.head[0], numbers.head[1:], _named_cells(numbers))))
-    return "\n\n".join(found) + "\n"
-
-
-def _named_cells(numbers: Numbers) -> list[tuple[str, list[TableCell]]]:
-    """Return the rows of a matrix, each with its name and its cells."""
-    rows = []
-    for name, *cells in numbers.rows:
-        rows.append((name, [TableCell(*cell.partition(" ")[::2]) for cell in cells]))
-    return rows

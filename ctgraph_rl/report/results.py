@@ -132,23 +132,12 @@ def rows_by_seed(runs: Sequence[Run]) -> list[Row]:
     rows = []
     for (name, agent), by_seed in grouped(runs).items():
         for seed, run in by_seed.items():
-            for line in _lines({seed: run}, bounds[name], "std"):
-                row = Row(name, agent, *line, seed=seed, columns=shown[name])
-                if row.measure != "interquartile_return":
-                    rows.append(_without_interval(row))
+            for measure, estimate, definition, note in _lines({seed: run}, bounds[name], "std"):
+                if measure != "interquartile_return":
+                    note = "" if estimate.n else note
+                    one = replace(estimate, low=None, high=None, method="one run", reason=None)
+                    rows.append(Row(name, agent, measure, one, definition, note=note, seed=seed, columns=shown[name]))
     return rows
-
-
-def _lines(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[MeasureLine]:
-    """Yield what the rows of an agent hold."""
-    yield from _metrics(by_seed, bounds, kind)
-    yield from _at_the_end(by_seed, bounds, kind)
-
-
-def _without_interval(row: Row) -> Row:
-    """Return the row of a run without what only several seeds have."""
-    estimate = replace(row.estimate, low=None, high=None, method="one run", reason=None)
-    return replace(row, estimate=estimate, note="" if estimate.n else row.note)
 
 
 def comparisons(runs: Sequence[Run], metric: str) -> dict[tuple[str, str, str], Comparison]:
@@ -171,15 +160,6 @@ def comparisons(runs: Sequence[Run], metric: str) -> dict[tuple[str, str, str], 
             compared = statistics.compare(_values(one, metric), _values(other, metric), bounds=limits)
             found[first[0], first[1], second[1]] = compared
     return statistics.corrected(found)
-
-
-def _pairs(runs: Sequence[Run], metric: str) -> dict[tuple[str, str, str], Comparison]:
-    """Return `comparisons`; refuse runs among which there are none."""
-    pairs = comparisons(runs, metric)
-    agents = ", ".join(f"{agent} on {curriculum}" for curriculum, agent in grouped(runs))
-    rule = f"--compare needs two agents with the same seeds on one curriculum, got {agents}"
-    require((bool(pairs), f"{rule}; add the runs of another agent, or leave --compare out"))
-    return pairs
 
 
 def selected(rows: Sequence[Row], names: Sequence[str] | None = None, also: Sequence[str] = ()) -> list[Row]:
@@ -226,13 +206,12 @@ def _no_measure(unknown: Sequence[str], choices: Iterable[str]) -> str:
 
 def write_csv(path: Path | str, rows: Sequence[Row]) -> None:
     """Write the table, empty cells for what is undefined; see `ctgraph_rl.log.escape.csv_text`."""
-    write_named(path, csv_text([HEADER, *map(_cells, rows)], "\r\n"))
-
-
-def _cells(row: Row) -> list[Any]:
-    e = row.estimate
-    numbers = (e.value, e.low, e.high, e.n, e.n_undefined, e.method)
-    return [row.curriculum, row.agent, row.measure, *numbers, row.definition, row.note, e.std, row.seed]
+    lines: list[Sequence[Any]] = [HEADER]
+    for row in rows:
+        e = row.estimate
+        numbers = (e.value, e.low, e.high, e.n, e.n_undefined, e.method)
+        lines.append((row.curriculum, row.agent, row.measure, *numbers, row.definition, row.note, e.std, row.seed))
+    write_named(path, csv_text(lines, "\r\n"))
 
 
 def write_tidy(path: Path, runs: Sequence[Run]) -> None:
@@ -250,31 +229,51 @@ def write_tidy(path: Path, runs: Sequence[Run]) -> None:
     write_evaluations(path, logs)
 
 
-def _metrics(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[MeasureLine]:
-    """A line for each metric; one for all if no run finished."""
+def _lines(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[MeasureLine]:
+    """Yield a line for each metric, one for all if no run finished, and those of how tasks ended."""
+    runs = by_seed.values()
     definitions: dict[str, str] = {}
+    tasks: dict[str, None] = {}
     for run in present(by_seed):
         for name, metric in run.metrics.items():
             definitions.setdefault(name, metric["definition"])
+        tasks |= dict.fromkeys(run.success)
     if not definitions:
         estimate = mean([None] * len(by_seed))
         yield NO_RUN_FINISHED, estimate, "", _note(by_seed, None, estimate)
     for name, definition in definitions.items():
-        estimate = _estimate(by_seed, name, bounds, kind)
+        estimate = _metric(by_seed, name, bounds, kind)
         yield name, estimate, definition, _note(by_seed, name, estimate)
+    ended: dict[str, Estimate] = {}
+    if any(run.tasks for run in present(by_seed)):
+        returns = [None if run is None else _mean([run.returns[task] for task in run.tasks]) for run in runs]
+        solved = [None if run is None else _mean([_solved(run, task) for task in run.tasks]) for run in runs]
+        ended["mean_final_return"] = _over_seeds(returns, bounds.of_returns, kind)
+        ended["solved_rate"] = _over_seeds(solved, (0.0, 1.0), kind)
+    if tasks:
+        of_tasks = [[None if run is None else run.returns.get(task) for run in runs] for task in tasks]
+        if kind == "iqm":
+            ended["interquartile_return"] = statistics.iqm(of_tasks)
+        else:
+            ended["interquartile_return"] = statistics.interquartile_mean(of_tasks, bounds=bounds.of_returns)
+    for task in tasks:
+        ended[f"solved {task}"] = statistics.solved_rate([_solved(run, task) for run in runs])
+    for measure, estimate in ended.items():
+        yield measure, estimate, AT_END[measure.split(" ")[0]].id, _note(by_seed, None, estimate)
 
 
-def _estimate(by_seed: BySeed, metric: str, bounds: BoundsOfRuns, kind: str) -> Estimate:
+def _metric(by_seed: BySeed, name: str, bounds: BoundsOfRuns, kind: str) -> Estimate:
     """Return a metric over seeds; a time as its median, infinite for a seed that never got there."""
-    if metric in metrics.METRICS and metrics.METRICS[metric].is_time:
-        times = []
-        for run in by_seed.values():
-            never = run is not None and run.metrics.get(metric, {}).get("n_undefined")
-            times.append(math.inf if never else _value(run, metric))
-        return statistics.median_time(times)
-    values = _values(by_seed, metric)
-    is_exact = metric in metrics.METRICS and metrics.METRICS[metric].is_exact
-    return statistics.constant(values) if is_exact else _over_seeds(values, bounds.of_metric(metric), kind)
+    values = _values(by_seed, name)
+    defined = metrics.METRICS.get(name)
+    if defined is not None and defined.is_time:
+        for place, run in enumerate(by_seed.values()):
+            if run is not None and run.metrics.get(name, {}).get("n_undefined"):
+                values[place] = math.inf
+        return statistics.median_time(values)
+    if defined is not None and defined.is_exact:
+        return statistics.constant(values)
+    return _over_seeds(values, bounds.of_metric(name), kind)
 
 
 def _over_seeds(values: Sequence[float | None], bounds: statistics.LowHigh, kind: str) -> Estimate:
@@ -288,45 +287,6 @@ def _over_seeds(values: Sequence[float | None], bounds: statistics.LowHigh, kind
     return mean(values, bounds=bounds)
 
 
-def _at_the_end(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[MeasureLine]:
-    """Return and share of solved tasks, the interquartile mean of returns, and each task's share of solved seeds."""
-    tasks: dict[str, None] = {}
-    own: dict[str, None] = {}
-    for run in present(by_seed):
-        tasks |= dict.fromkeys(run.success)
-        own |= dict.fromkeys(run.tasks)
-    if own:
-        yield from _over_tasks(by_seed, bounds, kind)
-    if tasks:
-        returns = []
-        for task in tasks:
-            returns.append([None if run is None else run.returns.get(task) for run in by_seed.values()])
-        if kind == "iqm":
-            estimate = statistics.iqm(returns)
-        else:
-            estimate = statistics.interquartile_mean(returns, bounds=bounds.of_returns)
-        yield _ended("interquartile_return", estimate, by_seed)
-    for task in tasks:
-        estimate = statistics.solved_rate([_solved(run, task) for run in by_seed.values()])
-        yield _ended(f"solved {task}", estimate, by_seed)
-
-
-def _over_tasks(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[MeasureLine]:
-    """Means over tasks that are not held out, after the last block; a seed needs a value of each."""
-    returns: list[float | None] = [None] * len(by_seed)
-    solved = returns.copy()
-    for place, run in enumerate(by_seed.values()):
-        if run is not None:
-            returns[place] = _mean([run.returns[task] for task in run.tasks])
-            solved[place] = _mean([_solved(run, task) for task in run.tasks])
-    yield _ended("mean_final_return", _over_seeds(returns, bounds.of_returns, kind), by_seed)
-    yield _ended("solved_rate", _over_seeds(solved, (0.0, 1.0), kind), by_seed)
-
-
-def _ended(measure: str, estimate: Estimate, by_seed: BySeed) -> MeasureLine:
-    return measure, estimate, AT_END[measure.split(" ")[0]].id, _note(by_seed, None, estimate)
-
-
 def _mean(values: Sequence[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return fmean(known) if known and len(known) == len(values) else None
@@ -338,32 +298,25 @@ def _solved(run: Run | None, task: str) -> bool | None:
 
 
 def _values(by_seed: BySeed, metric: str) -> list[float | None]:
-    return [_value(run, metric) for run in by_seed.values()]
-
-
-def _value(run: Run | None, metric: str) -> float | None:
-    return None if run is None or metric not in run.metrics else run.metrics[metric]["value"]
+    return [None if run is None else run.metrics.get(metric, {}).get("value") for run in by_seed.values()]
 
 
 def _note(by_seed: BySeed, metric: str | None, estimate: Estimate) -> str:
     """Why seeds have no value, each reason once with its seeds."""
     reasons: dict[str, list[str]] = {}
     for seed, run in by_seed.items():
-        reason = _missing(run, metric)
+        if run is None:
+            reason = "no run"
+        elif run.reason is not None or metric is None:
+            reason = run.reason
+        elif metric not in run.metrics:
+            reason = "another version, without this metric"
+        else:
+            reason = run.metrics[metric]["undefined"] if run.metrics[metric]["value"] is None else None
         if reason is not None:
             reasons.setdefault(reason, []).append(str(seed))
     notes = [f"seed {', '.join(seeds)}: {reason}" for reason, seeds in reasons.items()]
     return "; ".join(filter(None, [*notes, estimate.reason]))
-
-
-def _missing(run: Run | None, metric: str | None) -> str | None:
-    if run is None:
-        return "no run"
-    if run.reason is not None:
-        return run.reason
-    if metric is None or _value(run, metric) is not None:
-        return None
-    return run.metrics[metric]["undefined"] if metric in run.metrics else "another version, without this metric"
 
 
 def print_table(run_dirs: Sequence[Path]) -> None:
@@ -388,7 +341,11 @@ def main() -> None:
             runs, problems = find_runs(arguments.runs, count)
             require((bool(runs), why_left_out(problems)))
             runs = displayed(runs, arguments.agent)
-            pairs = {} if arguments.compare is None else _pairs(runs, arguments.compare)
+            pairs = {} if arguments.compare is None else comparisons(runs, arguments.compare)
+            agents = ", ".join(f"{agent} on {curriculum}" for curriculum, agent in grouped(runs))
+            rule = f"--compare needs two agents with the same seeds on one curriculum, got {agents}"
+            has_pairs = bool(pairs) or arguments.compare is None
+            require((has_pairs, f"{rule}; add the runs of another agent, or leave --compare out"))
             rows = rows_by_seed(runs) if arguments.per_seed else table(runs, arguments.statistics, count)
         names = None if arguments.metrics is None else list(map(str.strip, arguments.metrics.split(",")))
         also = ["interquartile_return"] if arguments.statistics == "iqm" else []

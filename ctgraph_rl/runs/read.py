@@ -225,7 +225,7 @@ def find_runs(paths: Iterable[Path | str], count: Count = silent) -> tuple[list[
         paths: directories.
         count: is called after each file that is read.
     """
-    found = []
+    found: list[Run] = []
     problems: list[Problem] = []
     refused: dict[Path, Path] = {}
     every = []
@@ -238,8 +238,7 @@ def find_runs(paths: Iterable[Path | str], count: Count = silent) -> tuple[list[
     for done, file in enumerate(every, 1):
         try:
             if file.name == LOG:
-                run = read_run(file.parent)
-                found.append(((*run.configuration, run.seed), run))
+                found.append(read_run(file.parent))
             elif not (file.parent / LOG).exists():
                 refused.setdefault(file.parent.resolve(), file.parent)
         except Exception as error:  # a broken directory is never an end for others
@@ -247,20 +246,19 @@ def find_runs(paths: Iterable[Path | str], count: Count = silent) -> tuple[list[
         count("runs read", done, len(every))
     problems += [Problem(folder, f"{folder} did not begin, {_failure(folder)}") for folder in refused.values()]
     runs: dict[tuple[Any, ...], Run] = {}
-    for key, run in [each for each in found if each[1].group[0] != EXPERT] or found:
-        twin = runs.setdefault(key, run)
-        if twin.path.resolve() != run.path.resolve():
-            problems.append(Problem(run.path, _twice(twin, run)))
+    for run in [run for run in found if run.group[0] != EXPERT] or found:
+        first = runs.setdefault((*run.configuration, run.seed), run)
+        if first.path.resolve() == run.path.resolve():
+            continue
+        reason = f"{first.path} and {run.path} are "
+        if run.agent is None:
+            name = 'Recorder(..., about={"learner": "NAME"})'
+            reason += f"both seed {run.seed} of the learner of {run.settings[FOLDER]}, the second is left out: "
+            reason += f"learners need names, such as {name}, or separate folders"
+        else:
+            reason += "one run twice; the second is left out"
+        problems.append(Problem(run.path, reason))
     return list(runs.values()), problems
-
-
-def _twice(first: Run, second: Run) -> str:
-    """Return why the second of two runs of one learner and seed is left out."""
-    both = f"{first.path} and {second.path} are"
-    if first.agent is not None:
-        return f"{both} one run twice; the second is left out"
-    name = 'learners need names, such as Recorder(..., about={"learner": "NAME"}), or separate folders'
-    return f"{both} both seed {first.seed} of the learner of {first.settings[FOLDER]}, the second is left out: {name}"
 
 
 def read_run(path: Path) -> Run:
@@ -285,17 +283,19 @@ def read_run(path: Path) -> Run:
         settings[FOLDER] = str(path.resolve().parent)
     try:
         log = RunLog.read(file)
-        history = _history(log)
+        values = list(_values(log))
+        history = _history(log, values)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         reason = str(error) if isinstance(error, ValueError) else f"{file}: a measurement lacks or misuses {error}"
         return Run(path, about, agent, settings, seed, reason=reason)
     metrics, why = _metrics(path, log)
-    values = list(_values(log, metrics))
+    for name, metric in metrics.items():
+        values.append(Value(*NOWHERE, metric=name, value=metric["value"]))
     return Run(path, about, agent, settings, seed, reason=why, metrics=metrics, values=values, history=history)
 
 
-def _values(log: RunLog, metrics: ReadOnlyValues) -> Iterator[Value]:
-    """Yield what a run measured in the order of its log, then its metrics."""
+def _values(log: RunLog) -> Iterator[Value]:
+    """Yield what a run measured, in the order of its log."""
     for m in log.measurements:
         prefix, names = MEASURES.get(m["kind"], ("", ()))
         is_task = "task" in m
@@ -304,8 +304,6 @@ def _values(log: RunLog, metrics: ReadOnlyValues) -> Iterator[Value]:
         for name in names:
             place = (m["block"], m.get("moment"), m["frames"], m.get("step"))
             yield Value(task, held_out, *place, metric=prefix + name, value=m.get(name))
-    for name, metric in metrics.items():
-        yield Value(*NOWHERE, metric=name, value=metric["value"])
 
 
 def _about(file: Path) -> NamedValues:
@@ -349,20 +347,17 @@ def called(part: Any) -> str | None:
 def _metrics(path: Path, log: RunLog) -> tuple[NamedValues, str | None]:
     """Return the metrics of a finished run, or why there are none."""
     file = path / METRICS
-    if not file.exists():
-        torn = ", with a torn last line" if log.torn_lines else ""
-        return {}, f"{_failure(path) or _unfinished(log)}{torn}"
-    try:
-        return metrics_of(read_regular(file, MOST_BYTES_OF_METRICS)), None
-    except (OSError, ValueError) as error:
-        return {}, f"{file} cannot be read: {error}"
-
-
-def _unfinished(log: RunLog) -> str:
-    """Return how far a run came that is not finished."""
-    total = log.of_kind("run")[0].get("num_frames")
-    reached = max(m.get("frames", 0) for m in log.measurements)
-    return "unfinished" if total is None else f"unfinished: {reached:,} of {total:,} frames"
+    if file.exists():
+        try:
+            return metrics_of(read_regular(file, MOST_BYTES_OF_METRICS)), None
+        except (OSError, ValueError) as error:
+            return {}, f"{file} cannot be read: {error}"
+    reason = _failure(path)
+    if reason is None:
+        total = log.of_kind("run")[0].get("num_frames")
+        reached = max(m.get("frames", 0) for m in log.measurements)
+        reason = "unfinished" if total is None else f"unfinished: {reached:,} of {total:,} frames"
+    return {}, f"{reason}, with a torn last line" if log.torn_lines else reason
 
 
 def _failure(path: Path) -> str | None:
@@ -370,27 +365,26 @@ def _failure(path: Path) -> str | None:
     return "failed: " + " ".join(failure(path).split()) if (path / FAILURE).exists() else None
 
 
-def _history(log: RunLog) -> History:
+def _history(log: RunLog, values: Sequence[Value]) -> History:
     about = log.of_kind("run")[0]
     performance = log.performance().tolist()
-    known = dict(enumerate(about.get("tasks") or (), 1))
-    evaluations: dict[str, Curve] = {}
+    labels = dict(enumerate(about.get("tasks") or (), 1))
     for m in log.of_kind("evaluation"):
         if not m.get("held_out"):
-            known[m["task"]] = label_of(m)
-            mean = math.nan if m["return_mean"] is None else m["return_mean"]
-            evaluations.setdefault(label_of(m), []).append((m["frames"], mean))
+            labels[m["task"]] = label_of(m)
+    evaluations: dict[str, Curve] = {}
     training: dict[int, Curve] = {}
-    for m in log.of_kind("training"):
-        if m["return_mean"] is not None:
-            training.setdefault(m["block"], []).append((m["frames"], m["return_mean"]))
+    for task, held_out, block, _, frames, _, metric, value in values:
+        if metric == "return_mean" and not held_out:
+            evaluations.setdefault(task, []).append((frames, math.nan if value is None else value))
+        elif metric == "training_return_mean" and value is not None:
+            training.setdefault(block, []).append((frames, value))
     adapted = {"trained": log.adaptation(), "held-out": log.adaptation(held_out=True)}
     experts_together: list[bool] = []
     for line in log.of_kind("experts"):
         experts_together += ["together" in each for each in line["experts"]]
-    seconds = log.measurements[-1].get("seconds", 0.0)
     return History(
-        labels=tuple(str(known.get(task, f"task {task}")) for task in range(1, len(performance[0]) + 1)),
+        labels=tuple(str(labels.get(task, f"task {task}")) for task in range(1, len(performance[0]) + 1)),
         trained=tuple(tuple(number - 1 for number in block) for block in about.get("trained") or ()),
         ends=tuple(log.ends()),
         performance=performance,
@@ -398,50 +392,44 @@ def _history(log: RunLog) -> History:
         training=training,
         spans=label_spans(log),
         adaptation={name: found for name, found in adapted.items() if found is not None},
-        seconds=seconds,
+        seconds=log.measurements[-1].get("seconds", 0.0),
         experts_together=tuple(experts_together),
     )
 
 
 def grouped(runs: Sequence[Run]) -> dict[AgentKey, dict[int, Run | None]]:
-    """Runs by seed, for each (curriculum, agent), as `_in_order`; None for a seed that only other agents have."""
+    """Return runs by seed, for each (curriculum, agent); None for a seed that only other agents have.
+
+    Runs of one curriculum and agent stand where the first of them is, by the settings in which they differ. A
+    curriculum has its shortest name, with its fingerprint where another one has the same name.
+    """
     groups: dict[tuple[Any, ...], dict[int, Run]] = {}
     expected: dict[CurriculumKey, set[int]] = {}
-    for run in _in_order(runs):
-        groups.setdefault(run.configuration, {})[run.seed] = run
-        if run.agent is not None:
-            expected.setdefault(run.group, set()).add(run.seed)
+    named: dict[CurriculumKey, str] = {}
+    for some in split_by(runs, _kind).values():
+        keys = _differing(some)
+        for run in sorted(some, key=lambda run: [_rank(run.settings.get(key)) for key in keys]):
+            groups.setdefault(run.configuration, {})[run.seed] = run
+            if run.agent is not None:
+                expected.setdefault(run.group, set()).add(run.seed)
+    for run in runs:
+        named[run.group] = min(named.get(run.group, run.curriculum[0]), run.curriculum[0], key=len)
+    several = repeated(named.values())
     one_each = [next(iter(by_seed.values())) for by_seed in groups.values()]
-    curricula = _curriculum_names(runs)
     found: dict[AgentKey, dict[int, Run | None]] = {}
     for one, agent, by_seed in zip(one_each, _agent_names(one_each), groups.values(), strict=True):
+        curriculum = named[one.group]
+        if curriculum in several:
+            curriculum += f" {one.group[1]}"
         seeds = sorted(by_seed if one.agent is None else expected[one.group])
         name = agent if one.shown is None else one.shown[1]
-        found[curricula[one.group], name] = {seed: by_seed.get(seed) for seed in seeds}
+        found[curriculum, name] = {seed: by_seed.get(seed) for seed in seeds}
     return dict(sorted(found.items(), key=lambda item: min(map(_place, item[1].values()))))
 
 
 def _place(run: Run | None) -> float:
     """Return the place of a run's agent; agents without one are behind all others, in their order."""
     return math.inf if run is None or run.shown is None else run.shown[0]
-
-
-def _curriculum_names(runs: Iterable[Run]) -> dict[CurriculumKey, str]:
-    """Each curriculum's shortest name, with its fingerprint where another one has the same name."""
-    named: dict[CurriculumKey, str] = {}
-    for run in runs:
-        named[run.group] = min(named.get(run.group, run.curriculum[0]), run.curriculum[0], key=len)
-    several = repeated(named.values())
-    return {group: f"{name} {group[1]}" if name in several else name for group, name in named.items()}
-
-
-def _in_order(runs: Sequence[Run]) -> list[Run]:
-    """Runs of one curriculum and agent where the first of them is, by the settings in which they differ."""
-    found: list[Run] = []
-    for some in split_by(runs, _kind).values():
-        keys = _differing(some)
-        found += sorted(some, key=lambda run: [_rank(run.settings.get(key)) for key in keys])
-    return found
 
 
 def _rank(value: Any) -> tuple[int, float, str]:
