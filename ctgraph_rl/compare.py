@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -61,8 +61,15 @@ def compare(one: Path, other: Path, bound: float = BOUND) -> Compared:
     if code == EQUAL and weights.startswith("different"):
         code = DIFFERENT
         verdict = "different: all measurements are equal, the agents' weights are not"
-    origins = _origins(logs[0].measurements[0], logs[1].measurements[0])
-    lines = [verdict, f"weights: {weights}", *origins, *_groups_of_experts(*logs)]
+    lines = [verdict, f"weights: {weights}"]
+    firsts = [log.measurements[0] for log in logs]
+    parts, others = map(_parts, firsts)
+    if not any(first.get("together") for first in firsts):
+        del parts[TOGETHER]
+    lines += [_compared(name, part, others[name], 10) for name, part in parts.items()]
+    experts, others = map(_seeds_of_experts, logs)
+    if any((*experts.values(), *others.values())):
+        lines.append(_compared(EXPERTS_TOGETHER, experts, others, 3))
     for path, log in zip((one, other), logs, strict=True):
         if log.torn_lines:
             lines.append(f"note: the last line of {path / LOG} is torn and not compared")
@@ -76,14 +83,6 @@ def _measured(line: LogLine) -> LogLine:
         return line
     alone = [{**each, "together": None} if isinstance(each, dict) else each for each in line["experts"]]
     return {**line, "experts": alone}
-
-
-def _groups_of_experts(*logs: RunLog) -> list[str]:
-    """Return a line on the seeds that single-task experts were trained with, if there are groups."""
-    one, other = map(_seeds_of_experts, logs)
-    if not any((*one.values(), *other.values())):
-        return []
-    return [_compared(EXPERTS_TOGETHER, one, other, 3)]
 
 
 def _seeds_of_experts(log: RunLog) -> NamedValues:
@@ -112,15 +111,18 @@ def _log(path: Path) -> RunLog:
 
 def _verdict(found: Sequence[Sequence[LogLine]], bound: float) -> tuple[int, str]:
     """Return the exit code and a sentence about the measurements."""
-    scale = _scale(found)
+    scale: dict[str, float] = {}
+    for line in chain(*found):
+        for key, value in line.items():
+            if is_real(value):
+                scale[key] = max(scale.get(key, 0.0), abs(value))
     lengths = list(map(len, found))
     unequal = None
     beyond = None
     for pair in zip(*found, strict=False):
         if pair[0] != pair[1] and beyond is None:
             unequal = unequal or pair
-            is_rounding = all(_close(*field, bound, scale) for field in _fields(*pair))
-            beyond = None if is_rounding else pair
+            beyond = None if _is_rounding(*pair, bound, scale) else pair
     if unequal is None and lengths[0] == lengths[1]:
         return EQUAL, f"equal: all {lengths[0]} measurements, bit for bit"
     if unequal is None:
@@ -133,26 +135,20 @@ def _verdict(found: Sequence[Sequence[LogLine]], bound: float) -> tuple[int, str
     return DIFFERENT, f"different since {since}{more}"
 
 
-def _fields(one: LogLine, other: LogLine) -> Iterator[tuple[str, Any, Any]]:
-    """Yield the fields of two lines with both values; None where a line lacks one."""
-    for key in {**one, **other}:
-        yield key, one.get(key), other.get(key)
+def _is_rounding(one: LogLine, other: LogLine, bound: float, scale: Mapping[str, float]) -> bool:
+    """Return whether the fields of two lines differ by no more than rounding; counts must be equal."""
+    for key in _differing(one, other):
+        first = one.get(key)
+        second = other.get(key)
+        are_floats = isinstance(first, float) and isinstance(second, float)
+        if not are_floats or abs(first - second) > bound * scale[key]:
+            return False
+    return True
 
 
-def _scale(found: Sequence[Sequence[LogLine]]) -> dict[str, float]:
-    """Return the largest size that the numbers of each field have in both runs."""
-    scale: dict[str, float] = {}
-    for line in chain(*found):
-        for key, value in line.items():
-            if is_real(value):
-                scale[key] = max(scale.get(key, 0.0), abs(value))
-    return scale
-
-
-def _close(key: str, one: Any, other: Any, bound: float, scale: Mapping[str, float]) -> bool:
-    """Return whether two values are equal, or differ by no more than rounding; counts must be equal."""
-    are_floats = isinstance(one, float) and isinstance(other, float)
-    return one == other or (are_floats and abs(one - other) <= bound * scale[key])
+def _differing(one: ReadOnlyValues, other: ReadOnlyValues) -> list[str]:
+    """Return the keys whose values differ; None where a side lacks one."""
+    return [key for key in {**one, **other} if one.get(key) != other.get(key)]
 
 
 def _where(line: LogLine) -> str:
@@ -165,7 +161,7 @@ def _where(line: LogLine) -> str:
 
 def _changes(one: ReadOnlyValues, other: ReadOnlyValues, most: int) -> str:
     """Return in words which values differ."""
-    pairs = [f"{key} {a!r} and {b!r}" for key, a, b in _fields(one, other) if a != b]
+    pairs = [f"{key} {one.get(key)!r} and {other.get(key)!r}" for key in _differing(one, other)]
     return terminal_text(listed(pairs, most))
 
 
@@ -205,15 +201,6 @@ def _same(one: Any, other: Any) -> bool:
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         return list(one) == list(other) and all(_same(one[key], other[key]) for key in one)
     return type(one) is type(other) and bool(one == other)
-
-
-def _origins(one: LogLine, other: LogLine) -> list[str]:
-    """Return a line for what the runs were: settings, curriculum, code and machine."""
-    of_one = _parts(one)
-    of_other = _parts(other)
-    if not (one.get("together") or other.get("together")):
-        del of_one[TOGETHER]
-    return [_compared(name, part, of_other[name], 10) for name, part in of_one.items()]
 
 
 def _parts(line: LogLine) -> dict[str, NamedValues]:

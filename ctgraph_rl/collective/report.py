@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from operator import itemgetter
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
 import numpy as np
 
-from ctgraph_rl.checks import NamedValues, require
+from ctgraph_rl.checks import require
 from ctgraph_rl.collective.summary import COLLECTIVE, RUN, WHAT, Collective, read_collective, tables
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.log.escape import csv_text, markdown_table, markdown_text
@@ -49,19 +48,21 @@ def find_collectives(paths: Sequence[Path | str]) -> list[Collective]:
     Raises:
         ValueError: if there is none; and see `read_collective`.
     """
-    folders: dict[Path, bool] = {}
+    folders: dict[Path, None] = {}
     for path in paths:
-        for log in files_below(Path(path), (COLLECTIVE,))[0]:
-            folders[log.parent] = (log.parent / METRICS).exists()
-    unfinished = [folder for folder, finished in folders.items() if not finished]
+        folders |= dict.fromkeys(log.parent for log in files_below(Path(path), (COLLECTIVE,))[0])
+    found = []
+    for folder in folders:
+        if (folder / METRICS).exists():
+            found.append(read_collective(folder))
+        else:
+            print_note("left out", f"{folder} is unfinished; the same command resumes it")
     where = ", ".join(map(str, paths))
     require(
         (bool(folders), f"no {COLLECTIVE} in or below {where}: run one with exchange=l2d2c"),
-        (not folders or any(folders.values()), f"no collective in or below {where} is finished: run it to its end"),
+        (not folders or bool(found), f"no collective in or below {where} is finished: run it to its end"),
     )
-    for folder in unfinished:
-        print_note("left out", f"{folder} is unfinished; the same command resumes it")
-    return [read_collective(folder) for folder, finished in folders.items() if finished]
+    return found
 
 
 def write_report(paths: Sequence[Path | str], folder: Path) -> Path:
@@ -83,31 +84,25 @@ def write_report(paths: Sequence[Path | str], folder: Path) -> Path:
     found = find_collectives(paths)
     with locked(made_folder(folder)):
         gallery = Gallery(folder)
-        for name, columns, rows in tables(found):
-            write_whole(folder / name, csv_text([columns, *rows]))
-        measured = [_row(each) for each in found]
-        cells = map(itemgetter(*COLUMNS), measured)
+        for name, rows in tables(found).items():
+            write_whole(folder / name, csv_text(rows))
+        measured = []
+        for each in found:
+            row = {**each.config["exchange"], **each.about, "helps": len(each.helps)}
+            for name in MEASURES:
+                row[name] = getattr(each, name)
+            for name in (*WHAT, "bytes"):
+                row[name] = each.total(name)
+            measured.append(row)
+        cells = [[row.get(name) for name in COLUMNS] for row in measured]
         write_whole(folder / "collectives.csv", csv_text([COLUMNS, *cells]))
         shown = [[markdown_text(_shown(row[name])) for name in SHOWN] for row in measured]
         parts = ["# Collectives", markdown_table(SHOWN, shown), MEANING]
-        for each in gallery.write((), _figures(found)):
-            parts.append(f"![{each.alt}]({each.path})\n\n{each.caption}")
+        for figure in gallery.write((), _figures(found)):
+            parts.append(f"![{figure.alt}]({figure.path})\n\n{figure.caption}")
         page = folder / "collectives.md"
         write_whole(page, "\n\n".join(parts) + "\n")
     return page
-
-
-def _row(collective: Collective) -> NamedValues:
-    """Return the values of `COLUMNS`."""
-    exchange = collective.config["exchange"]
-    row = {**collective.about, "helps": len(collective.helps)}
-    for name in ("every", "drop_prob", "delay_prob"):
-        row[name] = exchange.get(name)
-    for name in MEASURES:
-        row[name] = getattr(collective, name)
-    for name in (*WHAT, "bytes"):
-        row[name] = collective.total(name)
-    return row
 
 
 def _shown(value: Any) -> str:
@@ -125,7 +120,7 @@ def _figures(found: Sequence[Collective]) -> Iterator[CaptionedFigure]:
         "lines: means over seeds. Dotted: the value of the fewest members divided by N.",
         _draw_times(found),
     )
-    for each in [each for each in found if each.helps][:MOST_MAPS]:
+    for each in list(filter(lambda each: each.helps, found))[:MOST_MAPS]:
         caption = "Masks that each member (row) has taken over from each other (column), members counted from 0."
         title = (
             f"Who helped whom: {each.about['exchange']}, {each.about['num_members']} members, seed {each.about['seed']}"
@@ -161,8 +156,8 @@ def _draw_helps(collective: Collective) -> Any:
     figure = new_figure(0.6 * WIDTH, 0.5 * WIDTH)
     axes = figure.subplots()
     cells = np.zeros((count, count))
-    for (sender, receiver), times in collective.by_pair.items():
-        cells[receiver, sender] = times
+    for row in collective.helps:
+        cells[row["receiver"], row["sender"]] += 1
     image = axes.imshow(cells, cmap="viridis", vmin=0, interpolation="none")
     figure.colorbar(image, ax=axes, label="masks taken over")
     axes.set(xlabel="sender", ylabel="receiver")

@@ -48,7 +48,7 @@ class Learned(NamedTuple):
     label: str
     frames: int  # of the block
     frames_to_learn: int | None  # until `MASTERED` of a batch's episodes were at the goal; None if never
-    final_return: float  # mean of the last batches with finished episodes; NaN without any
+    final_return: float | None  # mean of the last batches with finished episodes
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,7 @@ class Collective:
     @property
     def learning_time(self) -> float:
         """Mean frames that a member needs to learn a block; what was not learned counts with all of its frames."""
-        times = [each.frames if each.frames_to_learn is None else each.frames_to_learn for each in self.learned]
-        return fmean(times)
+        return fmean(each.frames if each.frames_to_learn is None else each.frames_to_learn for each in self.learned)
 
     @property
     def share_learned(self) -> float:
@@ -86,20 +85,12 @@ class Collective:
     def final_return(self) -> float:
         """Sum of the final returns of all members, each the mean over its blocks; blocks without one count 0."""
         blocks = Counter(each.member for each in self.learned)
-        values = []
-        for each in self.learned:
-            if not math.isnan(each.final_return):
-                values.append(each.final_return / blocks[each.member])
-        return math.fsum(values)
+        known = [each for each in self.learned if each.final_return is not None]
+        return math.fsum(each.final_return / blocks[each.member] for each in known)
 
     def total(self, what: str) -> int:
         """Return the sum of a column of the messages."""
         return sum(row[what] for row in self.messages)
-
-    @property
-    def by_pair(self) -> Counter[tuple[int, int]]:
-        """How often a sender has helped a receiver."""
-        return Counter((row["sender"], row["receiver"]) for row in self.helps)
 
 
 def read_collective(path: Path | str) -> Collective:
@@ -125,18 +116,21 @@ def read_collective(path: Path | str) -> Collective:
 
 
 def _learned(path: Path, number: int, about: ReadOnlyValues) -> Iterator[Learned]:
-    """Yield what a member learned in each of its blocks."""
+    """Yield what a member learned in each of its blocks; by returns, where tasks have no goal."""
     log = RunLog.read(member_folder(path, number) / LOG)
     trained = log.of_kind("run")[0]["trained"]
-    lines = split_by(log.of_kind("training"), lambda line: line["block"])
     start = 0
-    for block, own in sorted(lines.items()):
-        known = [line for line in own if line["return_mean"] is not None]
-        reached = [line["frames"] - start for line in known if _is_mastered(line)]
-        last = [line["return_mean"] for line in known[-LAST:]]
+    for block, own in sorted(split_by(log.of_kind("training"), lambda line: line["block"]).items()):
+        returns = []
+        reached = []
+        for line in own:
+            if line["return_mean"] is not None:
+                returns.append(line["return_mean"])
+                share = line.get("success_rate")
+                if (returns[-1] if share is None else share) >= MASTERED:
+                    reached.append(line["frames"] - start)
         label = " ".join(about["labels"][task - 1] for task in trained[block - 1])
         end = own[-1]["frames"]
-        final = fmean(last) if last else math.nan
         yield Learned(
             number,
             about["seed"],
@@ -144,15 +138,9 @@ def _learned(path: Path, number: int, about: ReadOnlyValues) -> Iterator[Learned
             label,
             frames=end - start,
             frames_to_learn=min(reached, default=None),
-            final_return=final,
+            final_return=fmean(returns[-LAST:]) if returns else None,
         )
         start = end
-
-
-def _is_mastered(batch: ReadOnlyValues) -> bool:
-    """Return whether a batch's episodes are at the goal; by their return where tasks have no goal."""
-    share = batch.get("success_rate")
-    return bool((batch["return_mean"] if share is None else share) >= MASTERED)
 
 
 def describe_collective(collective: Collective) -> str:
@@ -174,40 +162,30 @@ def describe_collective(collective: Collective) -> str:
 def write_summary(run_dir: Path) -> None:
     """Write the tables of a collective whose members are finished and, last of all, its metrics."""
     collective = read_collective(run_dir)
-    for name, columns, rows in tables([collective]):
-        write_whole(run_dir / name, csv_text([columns, *rows]))
+    for name, rows in tables([collective]).items():
+        write_whole(run_dir / name, csv_text(rows))
     write_metrics(run_dir / METRICS, metrics(collective))
 
 
-def tables(collectives: Sequence[Collective]) -> Iterator[tuple[str, list[str], list[list[Any]]]]:
-    """Yield the name, the columns and the rows of each tidy table, of one or of several collectives."""
-    rows = []
-    for each in collectives:
-        for row in each.learned:
-            rows.append([*_run(each), *_plain(row)])
-    yield "members.csv", [*RUN, *Learned._fields], rows
-    yield _table(collectives, "messages", ["round", "frames", "message", *WHAT, "bytes"])
-    columns = ["round", "receiver", "sender", "block", "frames"]
+def tables(collectives: Sequence[Collective]) -> dict[str, list[list[Any]]]:
+    """Return the tidy tables of one or of several collectives by their files' names, columns first."""
+    messages = ["round", "frames", "message", *WHAT, "bytes"]
+    helps = ["round", "receiver", "sender", "block", "frames"]
     extra: set[str] = set()
     for each in collectives:
         extra.update(*each.helps)
-    yield _table(collectives, "helps", [*columns, *sorted(extra - {*columns, "kind", "seconds"})])
-
-
-def _run(collective: Collective) -> list[Any]:
-    return list(map(collective.about.get, RUN))
-
-
-def _plain(row: Learned) -> list[Any]:
-    return [None if isinstance(value, float) and math.isnan(value) else value for value in row]
-
-
-def _table(collectives: Sequence[Collective], part: str, columns: list[str]) -> tuple[str, list[str], list[list[Any]]]:
-    rows = []
+    helps += sorted(extra - {*helps, "kind", "seconds"})
+    found: dict[str, list[list[Any]]] = {
+        "members.csv": [[*RUN, *Learned._fields]],
+        "messages.csv": [[*RUN, *messages]],
+        "helps.csv": [[*RUN, *helps]],
+    }
     for each in collectives:
-        for row in getattr(each, part):
-            rows.append([*_run(each), *map(row.get, columns)])
-    return f"{part}.csv", [*RUN, *columns], rows
+        run = [each.about[name] for name in RUN]
+        found["members.csv"] += [[*run, *row] for row in each.learned]
+        found["messages.csv"] += [[*run, *map(row.get, messages)] for row in each.messages]
+        found["helps.csv"] += [[*run, *map(row.get, helps)] for row in each.helps]
+    return found
 
 
 def metrics(collective: Collective) -> dict[str, Metric]:

@@ -7,7 +7,6 @@ import shlex
 import sys
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from statistics import fmean
@@ -25,7 +24,7 @@ from ctgraph_rl.packages import check_packages, class_named
 from ctgraph_rl.profile.properties import Evidence, Measured, measure
 from ctgraph_rl.report.intervals import Bounds, gaffke
 from ctgraph_rl.report.names import displayed
-from ctgraph_rl.runs.read import MODIFIED, Problem, Run, find_runs, grouped, present
+from ctgraph_rl.runs.read import MODIFIED, Run, find_runs, grouped, present, why_left_out
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 LEVEL = 0.95
@@ -85,29 +84,19 @@ def score_of(results: Sequence[Measured], controls: Sequence[str] = ()) -> Score
         Undefined: where the controls leave no room.
     """
     means = [fmean(floors) for floors in zip(*(each.floors for each in results), strict=True)]
-    best = means.index(max(means))
+    floor = max(means)
     measured = fmean(each.value for each in results)
     optimum = fmean(each.optimum for each in results)
-    if optimum - means[best] <= 0:
-        raise Undefined(f"{controls[best] if controls else 'the floor'} leaves no room")
-    ratio = (measured - means[best]) / (optimum - means[best])
-    value = min(max(ratio, 0.0), 1.0)
+    if optimum - floor <= 0:
+        raise Undefined(f"{controls[means.index(floor)] if controls else 'the floor'} leaves no room")
+    value = min(max((measured - floor) / (optimum - floor), 0.0), 1.0)
     low = high = None
     if len(results) > 1:
         found = _exact_interval(results) if results[0].exact else _paired_interval(results)
         low = min(max(found[0], 0.0), value)
         high = max(min(found[1], 1.0), value)
     said = ", ".join(f"{name} {mean:.2f}" for name, mean in zip(controls, means, strict=False))
-    return Score(
-        value=value,
-        low=low,
-        high=high,
-        n=len(results),
-        measured=measured,
-        floor=means[best],
-        optimum=optimum,
-        controls=said,
-    )
+    return Score(value, low, high, len(results), measured=measured, floor=floor, optimum=optimum, controls=said)
 
 
 def _exact_interval(results: Sequence[Measured]) -> tuple[float, float]:
@@ -127,10 +116,10 @@ def _paired_interval(results: Sequence[Measured]) -> tuple[float, float]:
     """
     lows = []
     highs = []
-    for control in range(len(results[0].floors)):
-        pairs = [(each.value, each.floors[control]) for each in results]
-        lows.append(_highest(lambda score, pairs=pairs: rest_of_gain(pairs, score)[0] > 0))  # type: ignore[misc]
-        highs.append(_highest(lambda score, pairs=pairs: rest_of_gain(pairs, score)[1] >= 0))  # type: ignore[misc]
+    for floors in zip(*(each.floors for each in results), strict=True):
+        pairs = list(zip((each.value for each in results), floors, strict=True))
+        lows.append(_highest(pairs, lambda rest: rest[0] > 0))
+        highs.append(_highest(pairs, lambda rest: rest[1] >= 0))
     return min(lows), min(highs)
 
 
@@ -145,35 +134,17 @@ def rest_of_gain(pairs: Sequence[tuple[float, float]], score: float) -> tuple[fl
     return gaffke(rest, Bounds(-1.0, 1 - score), LEVEL)
 
 
-def _highest(holds: Callable[[float], bool]) -> float:
-    """Return the highest score in [0, 1] below which a property holds that no higher one has; 0 if none has it."""
+def _highest(pairs: Sequence[tuple[float, float]], holds: Callable[[tuple[float, float]], bool]) -> float:
+    """Return the highest score in [0, 1] whose `rest_of_gain` has a property that no higher one has; 0 if none."""
     low = 0.0
     high = 1.0
     for _ in range(HALVINGS):
         middle = (low + high) / 2
-        if holds(middle):
+        if holds(rest_of_gain(pairs, middle)):
             low = middle
         else:
             high = middle
     return low
-
-
-@dataclass
-class _Runs:
-    """The runs of the profile, by agent, curriculum and seed; the modified ones apart."""
-
-    by_name: dict[tuple[str, str, bool], dict[int, Run]] = field(default_factory=dict)
-    read: dict[Path, Evidence] = field(default_factory=dict)
-
-    def evidence(self, run: Run) -> Evidence:
-        """Return what a run has measured, which is read once.
-
-        Raises:
-            Undefined: for a run without results; see `_evidence`.
-        """
-        if run.path not in self.read:
-            self.read[run.path] = _evidence(run)
-        return self.read[run.path]
 
 
 class Results(NamedTuple):
@@ -226,67 +197,66 @@ def profile_results(paths: Sequence[Path | str], agents: Sequence[str] = ()) -> 
         names.update(prop.controls)
     runs, problems = find_runs(paths)
     runs = [run for run in runs if run.group[0] in names]
-    why = "; ".join(problem.reason for problem in problems)
-    first = next(iter(properties))
-    require((bool(runs), why or f"no run of a profile in {', '.join(map(str, paths))}: learn curriculum={first}"))
-    found = _Runs()
-    shown: dict[str, None] = {}
+    none = f"no run of a profile in {', '.join(map(str, paths))}: learn curriculum={next(iter(properties))}"
+    require((bool(runs), why_left_out(problems) or none))
+    of_agents: dict[str, dict[bool, RunsByName]] = {}
     for (curriculum, agent), by_seed in grouped(displayed(runs, agents)).items():
-        shown[agent] = None
+        kinds = of_agents.setdefault(agent, {False: {}, True: {}})
         for run in present(by_seed):
-            key = (agent, run.group[0], MODIFIED in curriculum)
-            found.by_name.setdefault(key, {})[run.seed] = run
+            kinds[MODIFIED in curriculum].setdefault(run.group[0], {})[run.seed] = run
+    read: dict[Path, Evidence] = {}
     results: dict[str, dict[str, Results]] = {}
-    for agent in shown:
+    for agent, kinds in of_agents.items():
         results[agent] = {}
         for name, prop in properties.items():
-            results[agent][prop.title] = _results(found, agent, name, prop, problems)
+            began = [problem.reason for problem in problems if problem.path.parent.name == name]
+            results[agent][prop.title] = _results(kinds, name, prop, read, began)
     return results
 
 
-def _results(found: _Runs, agent: str, name: str, prop: Any, problems: Sequence[Problem]) -> Results:
+RunsByName = dict[str, dict[int, Run]]
+"""The runs of an agent by curriculum and seed."""
+
+
+def _results(
+    kinds: Mapping[bool, RunsByName], name: str, prop: Any, read: dict[Path, Evidence], began: Sequence[str]
+) -> Results:
     """Return what an agent's seeds have measured: on the published curriculum, or else on a modified one."""
     gaps = []
-    for is_modified in (False, True):
-        by_seed = found.by_name.get((agent, name, is_modified), {})
+    for is_modified, runs in kinds.items():
         said = f"of {name}{MODIFIED}" if is_modified else ""
-        if by_seed:
+        if name in runs:
             try:
-                return Results(_over_seeds(found, agent, by_seed, prop, is_modified), said, prop.controls)
+                return Results(_over_seeds(runs, name, prop, read), said, prop.controls)
             except Undefined as error:
                 gaps.append(": ".join(filter(None, [said, str(error)])))
-    began = [problem.reason for problem in problems if problem.path.parent.name == name]
     return Results({}, next(iter([*gaps, *began]), "there is no run"))
 
 
-def _over_seeds(
-    found: _Runs, agent: str, by_seed: Mapping[int, Run], prop: Any, is_modified: bool
-) -> dict[int, Measured]:
-    """Return what each seed has measured.
+def _over_seeds(runs: RunsByName, name: str, prop: Any, read: dict[Path, Evidence]) -> dict[int, Measured]:
+    """Return what each seed has measured; each run is read once.
 
     Raises:
         Undefined: where one has not, with the reason and what gives it.
     """
     results = {}
-    for seed, run in sorted(by_seed.items()):
-        controls = []
-        for name in prop.controls:
-            control = found.by_name.get((agent, name, is_modified), {}).get(seed)
-            if control is None:
-                raise Undefined(f"{run.path} lacks its control {name}: {_command(run, name)}")
-            controls.append(found.evidence(control))
-        results[seed] = _measured(found.evidence(run), controls, prop)
+    for seed, run in sorted(runs[name].items()):
+        needed = []
+        for control in prop.controls:
+            if seed not in runs.get(control, {}):
+                raise Undefined(f"{run.path} lacks its control {control}: {_command(run, control)}")
+            needed.append(runs[control][seed])
+        for each in (*needed, run):
+            if each.path not in read:
+                read[each.path] = _evidence(each)
+        try:
+            measured = measure(read[run.path], [read[each.path] for each in needed], prop)
+        except (ValueError, OSError) as error:
+            raise Undefined(f"{run.path}: {error}") from error
+        if not all(map(math.isfinite, (measured.value, *measured.floors))):
+            raise Undefined(f"{run.path}: an evaluation has no mean return")
+        results[seed] = measured
     return results
-
-
-def _measured(run: Evidence, controls: Sequence[Evidence], prop: Any) -> Measured:
-    try:
-        measured = measure(run, controls, prop)
-    except (ValueError, OSError) as error:
-        raise Undefined(f"{run.folder}: {error}") from error
-    if not all(map(math.isfinite, (measured.value, *measured.floors))):
-        raise Undefined(f"{run.folder}: an evaluation has no mean return")
-    return measured
 
 
 def _evidence(run: Run) -> Evidence:

@@ -56,16 +56,29 @@ def print_summary(run_dir: Path | str, console: Console | None = None) -> None:
     console = Console() if console is None else console
     bars = BARS if console.encoding.lower().startswith("utf") else ASCII_BARS
     run = read_run(Path(run_dir))
-    require((run.history is not None, f"{run_dir} cannot be shown: {run.reason}"))
-    assert run.history is not None
+    history = run.history
+    require((history is not None, f"{run_dir} cannot be shown: {run.reason}"))
+    assert history is not None
     name = Path(run_dir).name
-    tables = [_matrix(name, run.history), _curves(sparklines(run.history.evaluations, bars))]
+    matrix = Table(title=_text(f"{name}: mean return on each task after each block"))
+    for heading in ("block", "frames", *history.labels):
+        matrix.add_column(_text(heading), justify="right")
+    for block, (frames, values) in enumerate(zip(history.ends, history.performance, strict=False)):
+        matrix.add_row(str(block), f"{frames:,}", *map(_shown, values))
+    curves = Table("task", "mean return at every evaluation")
+    for label, line in sparklines(history.evaluations, bars).items():
+        curves.add_row(_text(label), _text(line))
+    tables = [matrix, curves]
     if max(map(_width, tables)) > console.width:
-        tables = [_task_table(name, run.history, bars, console.width)]
+        of_tasks = _tasks(name, history, {})
+        room = console.width - _width(of_tasks) - len("│  ")
+        if room >= FEWEST_POINTS:
+            of_tasks = _tasks(name, history, sparklines(history.evaluations, bars, min(room, MOST_POINTS)))
+        tables = [of_tasks]
     modified = modification(run)
     if modified:
         console.print(_text(f"{run.curriculum[0]}: {modified}"))
-    always = columns(run.history.trained, bool(run.history.adaptation))
+    always = columns(history.trained, bool(history.adaptation))
     for table in (*tables, metrics_table(run.metrics, always)):
         console.print(table)
 
@@ -90,81 +103,39 @@ def sparklines(evaluations: Mapping[str, Curve], bars: str = BARS, most: int = M
         known += [value for _, value in curve if not math.isnan(value)]
     low = min(known)
     high = max(known)
-
-    def bar(values: Sequence[float]) -> str:
-        there = [value for value in values if not math.isnan(value)]
-        return bars[round((fmean(there) - low) / (high - low) * (len(bars) - 1))] if there else " "
-
-    return {label: "".join(map(bar, _shared(curve, most))) for label, curve in evaluations.items()}
-
-
-def _shared(curve: Curve, most: int) -> list[list[float]]:
-    """Return the values of a curve in at most so many parts of nearly equal length."""
-    places = min(most, len(curve))
-    values = [value for _, value in curve]
-    parts = []
-    for place in range(places):
-        parts.append(values[len(curve) * place // places : len(curve) * (place + 1) // places])
-    return parts
+    lines = {}
+    for label, curve in evaluations.items():
+        places = min(most, len(curve))
+        line = ""
+        for place in range(places):
+            part = curve[len(curve) * place // places : len(curve) * (place + 1) // places]
+            there = [value for _, value in part if not math.isnan(value)]
+            line += bars[round((fmean(there) - low) / (high - low) * (len(bars) - 1))] if there else " "
+        lines[label] = line
+    return lines
 
 
-def _matrix(name: str, history: History) -> Table:
-    """Return the performance matrix: mean return on each task after each block."""
-    table = Table(title=_text(f"{name}: mean return on each task after each block"))
-    for heading in ("block", "frames", *history.labels):
-        table.add_column(_text(heading), justify="right")
-    for block, (frames, values) in enumerate(zip(history.ends, history.performance, strict=False)):
-        table.add_row(str(block), f"{frames:,}", *map(_shown, values))
-    return table
-
-
-def _curves(curves: Mapping[str, str]) -> Table:
-    table = Table()
-    for name in ("task", "mean return at every evaluation"):
-        table.add_column(name)
-    for label, curve in curves.items():
-        table.add_row(_text(label), _text(curve))
-    return table
-
-
-def _task_table(name: str, history: History, bars: str, width: int) -> Table:
-    """Return a line for each task, with a curve as long as there is room for within a width."""
-    where = f"performance.csv has it after each of {len(history.ends) - 1} blocks"
-    title = f"{name}: mean return on each task; {where}"
-    room = width - _width(_tasks(title, history, {})) - len("│  ")
-    if room < FEWEST_POINTS:
-        return _tasks(title, history, {})
-    return _tasks(title, history, sparklines(history.evaluations, bars, min(room, MOST_POINTS)))
-
-
-def _tasks(title: str, history: History, curves: Mapping[str, str]) -> Table:
+def _tasks(name: str, history: History, curves: Mapping[str, str]) -> Table:
     """Return a line for each task: its return before training, the best one after a block, the last one, and its curve.
 
     The block of a best that is not above 0 is left out: that is of no block.
     """
-    table = Table(title=_text(title))
+    where = f"performance.csv has it after each of {len(history.ends) - 1} blocks"
+    table = Table(title=_text(f"{name}: mean return on each task; {where}"))
     for heading in ("task", "before", "best", "in block", "at end"):
         table.add_column(heading, justify="left" if heading == "task" else "right")
     if curves:
         table.add_column("curve")
     by_task = zip(*history.performance[: len(history.ends)], strict=True)
-    for label, values in zip(history.labels, by_task, strict=True):
-        curve = [_text(curves.get(label, ""))] if curves else []
-        table.add_row(_text(_shortened(label)), *_summary(values), *curve)
-    return table
-
-
-def _summary(values: Sequence[float]) -> tuple[str, ...]:
-    """Return a task's return before training, its best after a block, that block, and its last one."""
-    known = [(value, -block) for block, value in enumerate(values) if block and not math.isnan(value)]
-    best, block = max(known, default=(math.nan, 0))
-    return _shown(values[0]), _shown(best), str(-block) if best > 0 else "-", _shown(values[-1])
-
-
-def _shortened(label: str) -> str:
-    """Return a label of at most `LONGEST_LABEL` characters; the middle of a longer one is left out."""
     half = LONGEST_LABEL // 2
-    return label if len(label) <= LONGEST_LABEL else f"{label[: half - 2]}...{label[1 - half :]}"
+    for label, values in zip(history.labels, by_task, strict=True):
+        known = [(value, -block) for block, value in enumerate(values) if block and not math.isnan(value)]
+        best, block = max(known, default=(math.nan, 0))
+        short = label if len(label) <= LONGEST_LABEL else f"{label[: half - 2]}...{label[1 - half :]}"
+        curve = [_text(curves.get(label, ""))] if curves else []
+        numbers = (_shown(values[0]), _shown(best), str(-block) if best > 0 else "-", _shown(values[-1]))
+        table.add_row(_text(short), *numbers, *curve)
+    return table
 
 
 def _shown(value: float) -> str:
@@ -192,28 +163,23 @@ def mixed_code(runs: Iterable[Run]) -> list[str]:
     for run in runs:
         config = {**as_before(run.about["config"]), "seed": 0}
         learner = [run.agent, run.settings.get(FOLDER), None if "curriculum" in config else run.group]
-        how = json.dumps([config, learner], sort_keys=True)
-        of.setdefault(how, {}).setdefault(_state(run), []).append(run)
-    return [_sentence(list(some.values())) for some in of.values() if len(some) > 1]
-
-
-def _state(run: Run) -> tuple[str, str]:
-    (_, fingerprint), _, code = run.configuration
-    return fingerprint, code
-
-
-def _sentence(states: Sequence[Sequence[Run]]) -> str:
-    every = list(chain(*states))
-    fingerprints = len({run.group[1] for run in every}) > 1
-    parts = []
-    for some in states:
-        said = [f"fingerprint {some[0].group[1]}"] * fingerprints + [code_of(some[0], every)]
-        seeds = listed(sorted(run.seed for run in some), MOST_SEEDS)
-        parts.append(f"seed{'s' * (len(some) > 1)} {seeds} ({', '.join(filter(None, said))})")
-    who = (
-        f"{every[0].agent or every[0].settings[FOLDER]} on {every[0].group[0]} was run with different code, shown apart"
-    )
-    return f"{who}: {'; '.join(parts)}; overwrite=stale runs what is stale again"
+        group, _, code = run.configuration
+        states = of.setdefault(json.dumps([config, learner], sort_keys=True), {})
+        states.setdefault((group[1], code), []).append(run)
+    sentences = []
+    for states in of.values():
+        if len(states) == 1:
+            continue
+        every = list(chain(*states.values()))
+        fingerprints = len({run.group[1] for run in every}) > 1
+        parts = []
+        for some in states.values():
+            said = [f"fingerprint {some[0].group[1]}"] * fingerprints + [code_of(some[0], every)]
+            seeds = listed(sorted(run.seed for run in some), MOST_SEEDS)
+            parts.append(f"seed{'s' * (len(some) > 1)} {seeds} ({', '.join(filter(None, said))})")
+        who = f"{every[0].agent or every[0].settings[FOLDER]} on {every[0].group[0]} was run with different code"
+        sentences.append(f"{who}, shown apart: {'; '.join(parts)}; overwrite=stale runs what is stale again")
+    return sentences
 
 
 def print_problems(problems: Sequence[Problem], runs: Sequence[Run]) -> bool:
