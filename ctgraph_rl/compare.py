@@ -77,7 +77,6 @@ def compare(one: Path, other: Path, bound: float = BOUND) -> Compared:
 
 
 def _measured(line: LogLine) -> LogLine:
-    """Return what was measured, without the time and the seeds that experts were trained with."""
     line = without_time(line)
     if line["kind"] != "experts" or not isinstance(line.get("experts"), list):
         return line
@@ -86,7 +85,6 @@ def _measured(line: LogLine) -> LogLine:
 
 
 def _seeds_of_experts(log: RunLog) -> NamedValues:
-    """Return the seeds that the expert of each task was trained with."""
     found = {}
     for line in log.of_kind("experts"):
         for each in line.get("experts", ()):
@@ -96,12 +94,10 @@ def _seeds_of_experts(log: RunLog) -> NamedValues:
 
 
 def _compared(name: str, one: ReadOnlyValues, other: ReadOnlyValues, most: int) -> str:
-    """Return whether two sets of values are equal, in a line."""
     return f"{name}: {'equal' if one == other else 'different, ' + _changes(one, other, most)}"
 
 
 def _log(path: Path) -> RunLog:
-    """Return the log of a run, whose first measurement says what was run."""
     require(((path / LOG).is_file(), f"{path} holds no run: there is no {LOG}"))
     log = RunLog.read(path / LOG)
     begins = bool(log.measurements) and log.measurements[0]["kind"] == "run"
@@ -152,7 +148,6 @@ def _differing(one: ReadOnlyValues, other: ReadOnlyValues) -> list[str]:
 
 
 def _where(line: LogLine) -> str:
-    """Return which measurement a line is."""
     label = f" of {line['label']}" if "label" in line else ""
     block = f" in block {line['block']}" if "block" in line else ""
     frames = f" after {line['frames']:,} frames" if is_real(line.get("frames")) else ""
@@ -160,13 +155,11 @@ def _where(line: LogLine) -> str:
 
 
 def _changes(one: ReadOnlyValues, other: ReadOnlyValues, most: int) -> str:
-    """Return in words which values differ."""
     pairs = [f"{key} {one.get(key)!r} and {other.get(key)!r}" for key in _differing(one, other)]
     return terminal_text(listed(pairs, most))
 
 
 def _weights(one: Path, other: Path) -> str:
-    """Return how the weights of the agents compare."""
     missing = [str(path) for path in (one, other) if not (path / AGENT).exists()]
     if missing:
         return terminal_text(f"not compared, {' and '.join(missing)} has no {AGENT}")
@@ -181,7 +174,6 @@ def _weights(one: Path, other: Path) -> str:
 
 
 def _state(path: Path) -> ReadOnlyValues:
-    """Return what an agent saved."""
     content = read_content(path)
     try:
         state = read_plain(content)
@@ -192,7 +184,6 @@ def _state(path: Path) -> ReadOnlyValues:
 
 
 def _same(one: Any, other: Any) -> bool:
-    """Return whether two plain values are equal, tensors bit by bit."""
     if isinstance(one, torch.Tensor) and isinstance(other, torch.Tensor):
         alike = (one.dtype, one.shape) == (other.dtype, other.shape)
         return alike and torch.equal(view_bits(one), view_bits(other))

@@ -112,7 +112,6 @@ def _shown(value: Any) -> str:
 
 
 def _figures(found: Sequence[Collective]) -> Iterator[CaptionedFigure]:
-    """Yield the figures: learning time over the number of members, and for each collective who helped whom."""
     yield CaptionedFigure(
         "learning_time",
         "Learning time",
@@ -129,7 +128,6 @@ def _figures(found: Sequence[Collective]) -> Iterator[CaptionedFigure]:
 
 
 def _draw_times(found: Sequence[Collective]) -> Any:
-    """Draw learning times over numbers of members, a line for each curriculum, agent, method and exchange."""
     lines: dict[str, dict[int, list[float]]] = {}
     for each in found:
         name = " ".join(str(each.about[part]) for part in ("exchange", "curriculum", "agent", "method"))
@@ -151,7 +149,6 @@ def _draw_times(found: Sequence[Collective]) -> Any:
 
 
 def _draw_helps(collective: Collective) -> Any:
-    """Draw how often each member has helped each other."""
     count = collective.about["num_members"]
     figure = new_figure(0.6 * WIDTH, 0.5 * WIDTH)
     axes = figure.subplots()

@@ -155,7 +155,6 @@ def _rows(log: RunLog, kind: str, names: Sequence[str]) -> Iterator[list[Any]]:
 
 
 def _parquet(arrow: Any, types: Mapping[str, str], rows: Sequence[Sequence[Any]]) -> bytes:
-    """Return the content of a Parquet file."""
     from pyarrow import parquet
 
     schema = arrow.schema([(name, arrow.type_for_alias(type_)) for name, type_ in types.items()])

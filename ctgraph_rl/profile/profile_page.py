@@ -64,7 +64,6 @@ def write_profile(paths: Sequence[Path | str], folder: Path | str, agents: Seque
 
 
 def _by_agent(scores: Profiles, titles: Sequence[str], show: Callable[[Score], str]) -> str:
-    """Return a table in Markdown with a row for each property and a column for each agent."""
     rows = []
     for title in titles:
         rows.append([title, *(show(of_agent[title]) for of_agent in scores.values())])

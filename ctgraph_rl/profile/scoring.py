@@ -221,7 +221,6 @@ RunsByName = dict[str, dict[int, Run]]
 def _results(
     kinds: Mapping[bool, RunsByName], name: str, prop: Any, read: dict[Path, Evidence], began: Sequence[str]
 ) -> Results:
-    """Return what an agent's seeds have measured: on the published curriculum, or else on a modified one."""
     gaps = []
     for is_modified, runs in kinds.items():
         said = f"of {name}{MODIFIED}" if is_modified else ""

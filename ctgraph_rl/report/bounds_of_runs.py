@@ -15,7 +15,7 @@ from ctgraph_rl.metrics.bounds import Known, of_performance
 from ctgraph_rl.metrics.record import METRICS
 from ctgraph_rl.report.intervals import SCALED_DIGITS, UNBOUNDED, Bounds
 from ctgraph_rl.report.statistics import Estimate, constant, mean
-from ctgraph_rl.runs.read import Run, grouped, present
+from ctgraph_rl.runs.read import Run, by_curriculum, histories
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.task_like import TaskLike
 from ctgraph_rl.tasks.protocol import Evaluation
@@ -71,10 +71,7 @@ NO_BOUNDS = BoundsOfRuns()
 
 def bounds_by_curriculum(runs: Sequence[Run]) -> dict[str, BoundsOfRuns]:
     """Return the bounds of what the runs of each curriculum measure, by the curriculum's name in tables."""
-    of: dict[str, list[Run]] = {}
-    for (name, _), by_seed in grouped(runs).items():
-        of.setdefault(name, []).extend(present(by_seed))
-    return {name: bounds_of(some) for name, some in of.items()}
+    return {name: bounds_of(some) for name, some in by_curriculum(runs).items()}
 
 
 def bounds_of(runs: Iterable[Run]) -> BoundsOfRuns:
@@ -82,16 +79,15 @@ def bounds_of(runs: Iterable[Run]) -> BoundsOfRuns:
 
     Sums over time have those of the run with the most evaluations: the first one may be unfinished.
     """
-    curriculum: Curriculum | None = None
+    known = [run for run in runs if run.history is not None]
+    curriculum = next(filter(None, map(curriculum_of, known)), None)
+    if curriculum is None:
+        return NO_BOUNDS
     evaluations = 1
-    for run in runs:
-        if run.history is None:
-            continue
-        if curriculum is None:
-            curriculum = curriculum_of(run)
-        for curve in run.history.evaluations.values():
+    for history in histories(known):
+        for curve in history.evaluations.values():
             evaluations = max(evaluations, sum(frames > 0 for frames, _ in curve))
-    return NO_BOUNDS if curriculum is None else bounds_of_curriculum(curriculum, evaluations)
+    return bounds_of_curriculum(curriculum, evaluations)
 
 
 def bounds_of_curriculum(curriculum: Curriculum, evaluations: int = 1) -> BoundsOfRuns:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from ctgraph_rl import metrics
 from ctgraph_rl.metrics import METRICS, Trained
 from ctgraph_rl.metrics.curves import find_returns
-from ctgraph_rl.runs.read import History, Run, grouped, present
+from ctgraph_rl.runs.read import Run, by_curriculum, histories
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 IN_ORDER = tuple(metric.__name__ for metric in metrics.SUMMARY)
@@ -56,12 +56,9 @@ def board_columns(curriculum: Curriculum) -> list[str]:
 
 def columns_of_runs(runs: Sequence[Run]) -> dict[str, tuple[str, ...]]:
     """Return `columns` of each curriculum, by its name in tables."""
-    histories: dict[str, list[History]] = {}
-    for (name, _), by_seed in grouped(runs).items():
-        known = [run.history for run in present(by_seed) if run.history is not None]
-        histories.setdefault(name, []).extend(known)
     found = {}
-    for name, some in histories.items():
-        trained = max((history.trained for history in some), key=len, default=())
-        found[name] = columns(trained, any(history.adaptation for history in some))
+    for name, some in by_curriculum(runs).items():
+        known = histories(some)
+        trained = max((history.trained for history in known), key=len, default=())
+        found[name] = columns(trained, any(history.adaptation for history in known))
     return found

@@ -94,7 +94,6 @@ def matrices(rows: Sequence[Row], modified: Modified = NOT_MODIFIED, legend: str
 
 
 def _notes(rows: Sequence[Row]) -> list[str]:
-    """Return the notes of rows, each once, in the order of their numbers."""
     return list(dict.fromkeys(row.note for row in rows if row.note))
 
 

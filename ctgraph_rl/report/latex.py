@@ -105,7 +105,6 @@ def latex(table: Table) -> str:
 
 
 def _tabular(table: Table, rows: TableRows, start: int, end: int) -> str:
-    """Return some columns of a table, scaled down where they are wider than a line."""
     heads = [latex_text(table.first), *map(_heading, table.head[start:end])]
     lines = [r"\sbox2{%", rf"\begin{{tabular}}{{@{{}}l{'r' * (len(heads) - 1)}@{{}}}}", r"\toprule"]
     lines += [" & ".join(heads) + r" \\", r"\midrule"]
@@ -124,7 +123,6 @@ def _tabular(table: Table, rows: TableRows, start: int, end: int) -> str:
 
 
 def _heading(name: str) -> str:
-    """Return a heading of several lines, right-aligned as its column is."""
     lines = [latex_text(line) for line in textwrap.wrap(name, HEADING, break_long_words=False, break_on_hyphens=False)]
     shown = r" \\ ".join(lines)
     return shown if len(lines) < 2 else rf"\begin{{tabular}}[b]{{@{{}}r@{{}}}}{shown}\end{{tabular}}"

@@ -8,7 +8,7 @@ from typing import Any
 
 from ctgraph_rl.checks import did_you_mean, repeated, require
 from ctgraph_rl.report.bounds_of_runs import curriculum_of, published
-from ctgraph_rl.runs.read import MODIFIED, Run, grouped, present
+from ctgraph_rl.runs.read import MODIFIED, Run, by_curriculum, grouped, present
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 NOT_COMPARED = ("name", "source", "fingerprint", "schema", "about")
@@ -21,11 +21,10 @@ MOST_CHANGES, MOST_VALUES = 6, 3
 def modifications(runs: Sequence[Run]) -> dict[str, str]:
     """Return what differs from the published curriculum, for each modified one by its name in tables."""
     found: dict[str, str] = {}
-    for (name, _), by_seed in grouped(runs).items():
-        for run in present(by_seed):
-            said = "" if name in found else modification(run)
-            if said:
-                found[name] = said
+    for name, some in by_curriculum(runs).items():
+        said = next(filter(None, map(modification, some)), "")
+        if said:
+            found[name] = said
     return found
 
 
@@ -101,7 +100,6 @@ def displayed(runs: Sequence[Run], agents: Sequence[str] = ()) -> list[Run]:
 
 
 def _agents(runs: Sequence[Run]) -> list[str]:
-    """Return the names of agents in tables, each once."""
     return list(dict.fromkeys(agent for _, agent in grouped(runs)))
 
 

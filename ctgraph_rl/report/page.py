@@ -204,7 +204,6 @@ def facts(section: Section) -> Iterator[tuple[str, Any]]:
 
 
 def _agent(section: Section, result: Result, gallery: Gallery) -> AgentPart:
-    """Draw an agent's figures, and return its part with sentences on what is missing and why."""
     trees = find_trees(result.finished[0]) if result.finished else None
     drawn = () if trees is None else (draw(section, result, trees) for draw in OF_AGENT)
     figures = gallery.write((section.name, result.agent), drawn)
@@ -222,7 +221,6 @@ def _agent(section: Section, result: Result, gallery: Gallery) -> AgentPart:
 
 
 def _numbers(section: Section, result: Result) -> dict[str, Table]:
-    """Both matrices with all intervals by their titles, where there are not too many tasks for a table."""
     if not result.finished or len(section.labels) > MOST_NAMES:
         return {}
     matrices = {"Mean return after each block": result.performance(), "Change by each block": result.transfer()}
@@ -242,7 +240,6 @@ def _numbers(section: Section, result: Result) -> dict[str, Table]:
 
 
 def _runs(result: Result) -> Iterator[TextRow]:
-    """Agent, seed, state, frames, minutes and directory of each run."""
     for seed, run in result.by_seed.items():
         if run is None:
             yield result.agent, str(seed), "no run", "", "", ""
@@ -253,7 +250,6 @@ def _runs(result: Result) -> Iterator[TextRow]:
 
 
 def _system(run: Run) -> str:
-    """Versions and hardware."""
     versions = ", ".join(f"{name} {version}" for name, version in (run.about.get("versions") or {}).items())
     threads = run.about.get("num_threads", "?")
     device = run.about["config"].get("device", "not said")

@@ -193,7 +193,6 @@ def selected(rows: Sequence[Row], names: Sequence[str] | None = None, also: Sequ
 
 
 def _no_measure(unknown: Sequence[str], choices: Iterable[str]) -> str:
-    """Return why measures cannot be shown, and what to do, about a user's own metric too."""
     known = list(choices)
     near = [nearest(name, known) for name in unknown]
     meant = ", ".join(dict.fromkeys(filter(None, near)))
@@ -302,7 +301,6 @@ def _values(by_seed: BySeed, metric: str) -> list[float | None]:
 
 
 def _note(by_seed: BySeed, metric: str | None, estimate: Estimate) -> str:
-    """Why seeds have no value, each reason once with its seeds."""
     reasons: dict[str, list[str]] = {}
     for seed, run in by_seed.items():
         if run is None:

@@ -23,7 +23,7 @@ from ctgraph_rl.report.intervals import UNBOUNDED, Bounds
 from ctgraph_rl.report.names import modifications
 from ctgraph_rl.report.results import AT_END, Row, table
 from ctgraph_rl.report.statistics import Estimate, mean
-from ctgraph_rl.runs.read import BySeed, Curve, History, Run, grouped, present, split_by
+from ctgraph_rl.runs.read import BySeed, Curve, History, Run, grouped, histories, present, split_by
 
 Estimates = list[list[Estimate]]
 """Estimates over seeds, [blocks][tasks]."""
@@ -75,16 +75,16 @@ class Result:
 
     def performance(self) -> Estimates:
         """Mean return on each task before training and after each block."""
-        return self._over_seeds([each.performance for each in _histories(self.finished)], self.bounds.of_task)
+        return self._over_seeds([each.performance for each in histories(self.finished)], self.bounds.of_task)
 
     def transfer(self) -> Estimates:
         """Changes of each task by each block: differences of successive rows of the performance matrix."""
-        changes = [np.diff(history.performance, axis=0).tolist() for history in _histories(self.finished)]
+        changes = [np.diff(history.performance, axis=0).tolist() for history in histories(self.finished)]
         return self._over_seeds(changes, self.bounds.of_change)
 
     def _over_seeds(self, matrices: Sequence[list[list[float]]], bounds: Callable[[str], Bounds]) -> Estimates:
         missing = [None] * (len(self.by_seed) - len(matrices))
-        labels = next((history.labels for history in _histories(self.finished)), ())
+        labels = next((history.labels for history in histories(self.finished)), ())
         estimates = []
         for rows in zip_longest(*matrices, fillvalue=[]):
             of_block = []
@@ -139,7 +139,7 @@ class Section:
     @cached_property
     def ends(self) -> tuple[int, ...]:
         """Frames at the end of each block, 0 first; of a block that a run does not measure, as others say."""
-        every = [history.ends for history in _histories(self.runs)]
+        every = [history.ends for history in histories(self.runs)]
         return tuple(accumulate(map(max, zip_longest(*every, fillvalue=0)), max)) or (0,)
 
     def definitions(self) -> dict[str, tuple[str, str, str]]:
@@ -168,7 +168,7 @@ def sections(runs: Sequence[Run], count: Count = silent) -> list[Section]:
 
 def evaluation_curve(runs: Iterable[Run], label: str, bounds: Bounds = UNBOUNDED) -> list[Point]:
     """Mean return on a task at all evaluations at which every run has a value."""
-    return over_seeds([history.evaluations.get(label, []) for history in _histories(runs)], bounds)
+    return over_seeds([history.evaluations.get(label, []) for history in histories(runs)], bounds)
 
 
 def mean_curve(history: History) -> Curve:
@@ -191,7 +191,13 @@ def training_curve(
         places: number of spans.
         bounds: of a return.
     """
-    curves = [_in_places(history.training.get(block, []), start, end, places) for history in _histories(runs)]
+    width = max((end - start) / places, 1)
+    curves = []
+    for history in histories(runs):
+        values: dict[int, list[float]] = {}
+        for frames, value in history.training.get(block, []):
+            values.setdefault(math.ceil((frames - start) / width), []).append(value)
+        curves.append([(min(round(start + place * width), end), fmean(some)) for place, some in values.items()])
     return over_seeds(curves, bounds)
 
 
@@ -205,25 +211,8 @@ def over_seeds(curves: Sequence[Curve], bounds: Bounds = UNBOUNDED) -> list[Poin
     points = []
     for frames, some in sorted(values.items()):
         if len(some) == len(curves):
-            points.append(_point(frames, some, bounds))
+            has_band = len(some) >= FEWEST_FOR_BANDS
+            band = mean(some, bounds=bounds) if has_band else None
+            low, high = (None, None) if band is None else (band.low, band.high)
+            points.append(Point(frames, fmean(some), low, high, len(some)))
     return points
-
-
-def _point(frames: int, values: Sequence[float], bounds: Bounds) -> Point:
-    if len(values) < FEWEST_FOR_BANDS:
-        return Point(frames, fmean(values), None, None, len(values))
-    estimate = mean(values, bounds=bounds)
-    return Point(frames, fmean(values), estimate.low, estimate.high, len(values))
-
-
-def _in_places(curve: Curve, start: int, end: int, places: int) -> Curve:
-    """Return means of a curve over equal spans of frames, each at its last frame."""
-    width = max((end - start) / places, 1)
-    values: dict[int, list[float]] = {}
-    for frames, value in curve:
-        values.setdefault(math.ceil((frames - start) / width), []).append(value)
-    return [(min(round(start + place * width), end), fmean(some)) for place, some in values.items()]
-
-
-def _histories(runs: Iterable[Run]) -> list[History]:
-    return [run.history for run in runs if run.history is not None]

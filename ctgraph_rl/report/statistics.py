@@ -482,7 +482,6 @@ def _middle_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def _known(values: Values) -> tuple[list[float], int]:
-    """Values of seeds that have one, and the number of others."""
     known = [number for number in map(_number, values) if number is not None]
     return known, len(values) - len(known)
 

@@ -156,7 +156,6 @@ def contrast(one: Sequence[float], other: Sequence[float]) -> float:
 
 
 def _luminance(colour: Sequence[float]) -> float:
-    """Return the relative luminance of a colour of sRGB."""
     linear = [value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4 for value in colour]
     return sum(weight * value for weight, value in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
 

@@ -32,5 +32,4 @@ def rendered(template: Path, **values: Any) -> str:
 
 
 def _one_line(value: Any) -> Any:
-    """Return a text in one line; HTML and values that are no text stay unchanged."""
     return terminal_text(value) if type(value) is str else value

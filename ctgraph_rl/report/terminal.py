@@ -84,7 +84,6 @@ def print_summary(run_dir: Path | str, console: Console | None = None) -> None:
 
 
 def _width(table: Table) -> int:
-    """Return the characters of a table's lines where nothing of them is wrapped or cut, its title apart."""
     return Console(width=WIDEST).measure(table).maximum
 
 

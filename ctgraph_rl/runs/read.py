@@ -295,7 +295,6 @@ def read_run(path: Path) -> Run:
 
 
 def _values(log: RunLog) -> Iterator[Value]:
-    """Yield what a run measured, in the order of its log."""
     for m in log.measurements:
         prefix, names = MEASURES.get(m["kind"], ("", ()))
         is_task = "task" in m
@@ -307,7 +306,6 @@ def _values(log: RunLog) -> Iterator[Value]:
 
 
 def _about(file: Path) -> NamedValues:
-    """Return the first line of a log, which says what was run."""
     first, _, _ = read_regular(file, MOST_BYTES).partition(b"\n")
     try:
         about = parsed(first)
@@ -345,7 +343,6 @@ def called(part: Any) -> str | None:
 
 
 def _metrics(path: Path, log: RunLog) -> tuple[NamedValues, str | None]:
-    """Return the metrics of a finished run, or why there are none."""
     file = path / METRICS
     if file.exists():
         try:
@@ -361,7 +358,6 @@ def _metrics(path: Path, log: RunLog) -> tuple[NamedValues, str | None]:
 
 
 def _failure(path: Path) -> str | None:
-    """Why a run failed, as it says itself."""
     return "failed: " + " ".join(failure(path).split()) if (path / FAILURE).exists() else None
 
 
@@ -427,6 +423,19 @@ def grouped(runs: Sequence[Run]) -> dict[AgentKey, dict[int, Run | None]]:
     return dict(sorted(found.items(), key=lambda item: min(map(_place, item[1].values()))))
 
 
+def by_curriculum(runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """Return runs by the name of their curriculum in tables, in the order of tables."""
+    found: dict[str, list[Run]] = {}
+    for (name, _), by_seed in grouped(runs).items():
+        found.setdefault(name, []).extend(present(by_seed))
+    return found
+
+
+def histories(runs: Iterable[Run]) -> list[History]:
+    """Return the histories of the runs whose logs can be read."""
+    return [run.history for run in runs if run.history is not None]
+
+
 def _place(run: Run | None) -> float:
     """Return the place of a run's agent; agents without one are behind all others, in their order."""
     return math.inf if run is None or run.shown is None else run.shown[0]
@@ -467,7 +476,6 @@ def code_of(run: Run, others: Sequence[Run]) -> str:
 
 
 def _kind(run: Run) -> tuple[CurriculumKey, str]:
-    """Return curriculum and name of the agent."""
     return run.group, _name(run)
 
 

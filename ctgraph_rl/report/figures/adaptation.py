@@ -13,6 +13,7 @@ from ctgraph_rl.report.figures.gallery import CaptionedFigure, left_out
 from ctgraph_rl.report.figures.learning_curves import named
 from ctgraph_rl.report.sections import Result, Section
 from ctgraph_rl.report.style import MOST_AGENTS, WIDTHS, agent_style, beside, figure_width, new_figure
+from ctgraph_rl.runs.read import histories
 
 KINDS = ("trained", "held-out")
 
@@ -55,12 +56,7 @@ def draw_adaptation(section: Section, kinds: list[str]) -> Any:
 
 
 def _of_seeds(result: Result, kind: str) -> list[Adaptation]:
-    """Return what the finished runs of an agent measured on trained or held-out tasks."""
-    found = []
-    for run in result.finished:
-        if run.history is not None and kind in run.history.adaptation:
-            found.append(run.history.adaptation[kind])
-    return found
+    return [history.adaptation[kind] for history in histories(result.finished) if kind in history.adaptation]
 
 
 def _episodes(curve: Tensor) -> range:

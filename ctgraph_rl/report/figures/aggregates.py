@@ -106,7 +106,6 @@ def _better(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _shown(section: Section) -> list[Result]:
-    """Return the agents with enough seeds."""
     return [result for result in section.results if len(result.finished) >= FEWEST_SEEDS and scores(result)]
 
 

@@ -49,7 +49,6 @@ def draw_experiments(found: Sequence[Section]) -> Any:
 
 
 def _agents(found: Sequence[Section]) -> list[str]:
-    """Return the names of all agents, each once."""
     agents: dict[str, None] = {}
     for section in found:
         agents |= dict.fromkeys(result.agent for result in section.results)

@@ -79,7 +79,6 @@ class Gallery:
         return written
 
     def _counted(self, figure: CaptionedFigure | None) -> CaptionedFigure | None:
-        """Count a figure, and return it."""
         self._done += 1
         if self._count is not None:
             self._count(self._done)

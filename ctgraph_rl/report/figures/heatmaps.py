@@ -103,7 +103,6 @@ def _show(axes: Any, values: np.ndarray, colours: str, low: float, high: float) 
 
 
 def _name(axes: Any, labels: Sequence[str], rows: int, first: int) -> None:
-    """Names of tasks below, numbers of blocks beside."""
     if len(labels) <= MOST_NAMES:
         upright = 90 if len(labels) > MOST_NUMBERS else 30
         side = "center" if upright == 90 else "right"
@@ -130,7 +129,6 @@ def _write(axes: Any, matrix: Estimates, image: Any, sign: str) -> None:
 
 
 def _box(axes: Any, trained: Sequence[Sequence[int]], first: int) -> None:
-    """A frame around the tasks that a block trains."""
     from matplotlib.patches import Rectangle
     from matplotlib.patheffects import withStroke
 

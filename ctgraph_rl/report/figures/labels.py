@@ -67,7 +67,6 @@ def draw_labels(section: Section) -> Any:
 
 
 def _draw_strip(axes: Any, row: int, spans: Sequence[Span], blocks: Sequence[Any], room: float) -> None:
-    """Draw the labels of a run, and a mark below each alarm."""
     of_label = dict(_tasks_of_labels(spans, blocks))
     for span in spans:
         colour = _colour(of_label.get(span.label))
@@ -79,7 +78,6 @@ def _draw_strip(axes: Any, row: int, spans: Sequence[Span], blocks: Sequence[Any
 
 
 def _runs(section: Section) -> list[tuple[str, Run]]:
-    """Return the finished runs with their own labels, each with agent and seed."""
     found = []
     for result in section.results:
         for run in result.finished:

@@ -21,6 +21,7 @@ from ctgraph_rl.report.sections import (
     training_curve,
 )
 from ctgraph_rl.report.style import MOST_AGENTS, agent_style, agents_legend, beside, frames_axis, panels, short
+from ctgraph_rl.runs.read import histories
 
 MOST_TASKS = 32
 """Tasks that have a panel."""
@@ -94,10 +95,10 @@ def draw_tasks(section: Section) -> Any:
     for task, (axes, label) in enumerate(zip(grid.ravel(), labels, strict=False)):
         _mark_blocks(axes, section, task)
         for position, result in enumerate(section.results[:MOST_AGENTS]):
-            seeds = [run.history.evaluations.get(label, []) for run in result.finished[: MOST_SEEDS + 1] if run.history]
-            seeds = seeds if len(seeds) <= MOST_SEEDS else []
+            seeds = [history.evaluations.get(label, []) for history in histories(result.finished)]
             look = agent_style(position, result.agent)
-            _draw(axes, look, [evaluation_curve(result.finished, label, result.bounds.of_task(label))], seeds)
+            points = evaluation_curve(result.finished, label, result.bounds.of_task(label))
+            _draw(axes, look, [points], seeds if len(seeds) <= MOST_SEEDS else [])
         axes.set_title(short(label))
     return _finished(grid, section, "mean return")
 
@@ -116,8 +117,7 @@ def draw_means(axes: Any, section: Section, looks: Mapping[str, dict[str, Any]])
     _mark_blocks(axes, section, None)
     for result in section.results:
         if result.agent in looks:
-            curves = [mean_curve(run.history) for run in result.finished if run.history]
-            seeds = list(filter(None, curves))
+            seeds = list(filter(None, map(mean_curve, histories(result.finished))))
             points = over_seeds(seeds, result.bounds.of_returns)
             _draw(axes, looks[result.agent], [points], seeds if len(seeds) <= MOST_SEEDS else [])
 
@@ -140,7 +140,6 @@ def draw_training(section: Section) -> Any:
 
 
 def _training(result: Result, blocks: Sequence[tuple[int, tuple[int, int]]], places: int) -> list[list[Point]]:
-    """Return the curve of each block."""
     curves = []
     for block, (start, end) in blocks:
         bounds = result.bounds.of_training
@@ -150,11 +149,10 @@ def _training(result: Result, blocks: Sequence[tuple[int, tuple[int, int]]], pla
 
 def has_training(section: Section) -> bool:
     """Return whether any run measured its return while training."""
-    return any(run.history is not None and run.history.training for run in section.finished)
+    return any(history.training for history in histories(section.finished))
 
 
 def _mark_blocks(axes: Any, section: Section, task: int | None) -> None:
-    """Dashed lines where blocks end, and grey behind those that train the task."""
     many = len(section.ends) > MANY_BLOCKS
     for end in section.ends[1:-1]:
         axes.axvline(end, color="0.55", linestyle=(0, (3, 2)), linewidth=0.25 if many else 0.6, zorder=0)
@@ -164,7 +162,6 @@ def _mark_blocks(axes: Any, section: Section, task: int | None) -> None:
 
 
 def _draw(axes: Any, look: Mapping[str, Any], pieces: Sequence[list[Point]], seeds: Sequence[LabelPlaces]) -> None:
-    """Draw a mean with its band, piece by piece, and thin lines for seeds."""
     if len(seeds) > 1:
         for curve in seeds:
             axes.plot(*zip(*curve, strict=True), color=look["color"], linestyle="-", linewidth=0.4, marker="", zorder=1)
@@ -195,10 +192,8 @@ def _finished(grid: Any, section: Section, ylabel: str) -> Any:
         row[0].set_ylabel(ylabel)
     figure = grid[0, 0].figure
     figure.supxlabel("frames", fontsize=8)
-    shown = []
-    for position, result in enumerate(section.results[:MOST_AGENTS]):
-        shown.append((named(result), agent_style(position, result.agent)))
-    agents_legend(figure, shown)
+    shown = enumerate(section.results[:MOST_AGENTS])
+    agents_legend(figure, [(named(result), agent_style(position, result.agent)) for position, result in shown])
     return figure
 
 
