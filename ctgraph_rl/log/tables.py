@@ -1,20 +1,15 @@
 """A run's log as tidy tables: one row per evaluation of a task, one row per training interval.
 
 CSV always, Parquet with ``pip install 'ctgraph_rl[tables]'``. The first columns say which run a row is of, so that the
-tables of many runs can be put below each other. Undefined and unmeasured values are empty cells, or null. A
-reader in three lines::
-
-    import csv
-    with open("evaluations.csv", newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-
-and in one, ``pandas.read_csv("evaluations.csv")`` or ``pandas.read_parquet("evaluations.parquet")``.
+tables of many runs can be put below each other. Undefined and unmeasured values are empty cells, or null.
+``pandas.read_csv("evaluations.csv")`` and ``pandas.read_parquet("evaluations.parquet")`` read them.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -80,16 +75,19 @@ def write_tables(log: RunLog, folder: Path | str, parquet: bool | None = None) -
     Raises:
         ModuleNotFoundError: with ``parquet=True`` and without pyarrow; names the extra to install.
     """
+    if parquet is None:
+        parquet = find_spec("pyarrow") is not None
+    elif parquet:
+        require_parquet()
     written = []
     for kind, (name, columns) in TABLES.items():
         types = _types(kind, columns, log)
-        rows = list(_rows(log, kind, list(types)))
+        rows = list(_rows(log, kind, types))
         written.append(Path(folder) / f"{name}.csv")
-        write_whole(written[-1], csv_text([list(types), *rows]))
-        arrow = None if parquet is False else _pyarrow(needed=parquet is True)
-        if arrow is not None:
+        write_whole(written[-1], csv_text([types, *rows]))
+        if parquet:
             written.append(Path(folder) / f"{name}.parquet")
-            write_whole(written[-1], _parquet(arrow, types, rows))
+            write_whole(written[-1], _parquet(types, rows))
     return written
 
 
@@ -119,13 +117,10 @@ def write_evaluations(path: Path, runs: Sequence[tuple[str, str, RunLog]]) -> No
     types = _types("evaluation", EVALUATIONS, *(log for _, _, log in runs))
     rows = []
     for agent, place, log in runs:
-        for row in _rows(log, "evaluation", list(types)):
-            rows.append([agent, place, *row])
+        rows += [[agent, place, *row] for row in _rows(log, "evaluation", types)]
     columns = {"agent": "string", "run": "string", **types}
-    if path.suffix == ".csv":
-        write_named(path, csv_text([list(columns), *rows]))
-    else:
-        write_named(path, _parquet(_pyarrow(needed=True), columns, rows))
+    is_csv = path.suffix == ".csv"
+    write_named(path, csv_text([columns, *rows]) if is_csv else _parquet(columns, rows))
 
 
 def require_parquet() -> None:
@@ -134,7 +129,10 @@ def require_parquet() -> None:
     Raises:
         ModuleNotFoundError: names the extra to install.
     """
-    _pyarrow(needed=True)
+    try:
+        import pyarrow  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError("Parquet tables need pyarrow: pip install 'ctgraph_rl[tables]'") from error
 
 
 def _types(kind: str, columns: dict[str, tuple[str, str]], *logs: RunLog) -> dict[str, str]:
@@ -149,27 +147,18 @@ def _types(kind: str, columns: dict[str, tuple[str, str]], *logs: RunLog) -> dic
     return types
 
 
-def _rows(log: RunLog, kind: str, names: Sequence[str]) -> Iterator[list[Any]]:
+def _rows(log: RunLog, kind: str, names: Iterable[str]) -> Iterator[list[Any]]:
     for row in log.rows(kind):
         yield list(map(row.get, names))
 
 
-def _parquet(arrow: Any, types: Mapping[str, str], rows: Sequence[Sequence[Any]]) -> bytes:
+def _parquet(types: Mapping[str, str], rows: Sequence[Sequence[Any]]) -> bytes:
+    import pyarrow
     from pyarrow import parquet
 
-    schema = arrow.schema([(name, arrow.type_for_alias(type_)) for name, type_ in types.items()])
+    schema = pyarrow.schema([(name, pyarrow.type_for_alias(type_)) for name, type_ in types.items()])
     columns = zip(*rows, strict=True) if rows else ([] for _ in types)
     values = [list(map(utf8_text, column)) for column in columns]
     buffer = io.BytesIO()
-    parquet.write_table(arrow.table(values, schema=schema), buffer)
+    parquet.write_table(pyarrow.table(values, schema=schema), buffer)
     return buffer.getvalue()
-
-
-def _pyarrow(needed: bool) -> Any:
-    try:
-        import pyarrow
-    except ModuleNotFoundError as error:
-        if not needed:
-            return None
-        raise ModuleNotFoundError("Parquet tables need pyarrow: pip install 'ctgraph_rl[tables]'") from error
-    return pyarrow

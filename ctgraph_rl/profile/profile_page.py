@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.log.escape import csv_text, markdown_table, markdown_text
 from ctgraph_rl.log.files import locked
-from ctgraph_rl.profile.scoring import Profiles, Score, profile_scores
+from ctgraph_rl.profile.scoring import Profiles, profile_scores
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, Gallery, left_out
 from ctgraph_rl.report.latex import Table, as_cell, document
 from ctgraph_rl.report.style import MOST_AGENTS, WIDTH, agent_style, new_figure, require_packages, short
@@ -49,25 +49,19 @@ def write_profile(paths: Sequence[Path | str], folder: Path | str, agents: Seque
             rows.append((agent, title, *each))
             if each.reason:
                 gaps.append(markdown_text(f"{agent}, {title}: {each.reason}"))
-    by_agent = _by_agent(scores, titles, str)
-    absolute = _by_agent(scores, titles, lambda score: score.absolute)
+    head = ["property", *map(markdown_text, scores)]
+    shown = [[title, *(str(of_agent[title]) for of_agent in scores.values())] for title in titles]
+    measured = [[title, *(of_agent[title].absolute for of_agent in scores.values())] for title in titles]
     table = Table(f"Profile. {MEANING}", "profile", "agent", titles, cells)
     folder = made_folder(Path(folder))
     with locked(folder):
         write_whole(folder / "profile.csv", csv_text(rows))
         write_whole(folder / "profile.tex", document([table]) + "\n")
         [drawn] = Gallery(folder).write((), _figures(scores))  # which draws them in the report's style
-        figure = f"![{drawn.alt}]({drawn.path})"
-        page = ["# Profile", figure, drawn.caption, by_agent, "## What was measured", absolute, *gaps]
+        page = ["# Profile", f"![{drawn.alt}]({drawn.path})", drawn.caption, markdown_table(head, shown)]
+        page += ["## What was measured", markdown_table(head, measured), *gaps]
         write_whole(folder / "profile.md", "\n\n".join(page) + "\n")
     return scores
-
-
-def _by_agent(scores: Profiles, titles: Sequence[str], show: Callable[[Score], str]) -> str:
-    rows = []
-    for title in titles:
-        rows.append([title, *(show(of_agent[title]) for of_agent in scores.values())])
-    return markdown_table(["property", *map(markdown_text, scores)], rows)
 
 
 def text_table(scores: Profiles) -> str:
@@ -96,19 +90,13 @@ def draw_profiles(scores: Profiles) -> Any:
     height = 0.8 / len(shown)
     for position, (agent, of_agent) in enumerate(shown):
         look = agent_style(position, agent)
-        estimates = np.array([each[:3] for each in of_agent.values()], dtype=float)  # None is not a number
+        values, lows, highs = np.array([each[:3] for each in of_agent.values()], dtype=float).T  # None is not a number
         places = numbers + (position + 0.5) * height - 0.4
-        _draw_bars(bars, places, height, estimates, color=look["color"], label=short(agent))
+        bars.barh(places, values, height, color=look["color"], label=short(agent))
+        bars.hlines(places, lows, highs, color="black", linewidth=0.8)
+        for place in places[np.isnan(values)]:
+            bars.text(0.01, place, "no value", va="center", fontsize=5, color=look["color"])
     bars.set_yticks(numbers, [f"{number} {title}" for number, title in enumerate(titles, 1)])
     bars.set(xlim=(0, 1), xlabel="score", ylim=(len(titles) + 0.5, 0.5))
     figure.legend(loc="outside upper center", ncols=4)
     return figure
-
-
-def _draw_bars(axes: Any, places: np.ndarray, height: float, estimates: np.ndarray, color: str, label: str) -> None:
-    """Draw the scores of an agent, float [properties, 3]: value and ends of the interval, NaN where there is none."""
-    values = estimates[:, 0]
-    axes.barh(places, values, height, color=color, label=label)
-    axes.hlines(places, estimates[:, 1], estimates[:, 2], color="black", linewidth=0.8)
-    for place in places[np.isnan(values)]:
-        axes.text(0.01, place, "no value", va="center", fontsize=5, color=color)

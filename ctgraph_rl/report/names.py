@@ -87,15 +87,22 @@ def displayed(runs: Sequence[Run], agents: Sequence[str] = ()) -> list[Run]:
         ValueError: for an unknown agent, with the one that was probably meant, and for a name of two agents.
     """
     known = _agents(runs)
-    chosen = dict(_choice(each, known) for each in agents)
+    chosen: dict[str, str] = {}
+    for each in agents:
+        fits = [name for name in known if each.startswith(f"{name}=")]
+        name = each if each in known else max(fits, key=len, default="")  # settings in names have the sign, too
+        shown = name if each in known else each[len(name) + 1 :].strip()
+        word = each.partition("=")[0]
+        unknown = f"--agent: there is no agent {word!r}: {did_you_mean(word, known)}"
+        require((bool(name), unknown), (not name or bool(shown), f"--agent {each!r} must have a name after the sign"))
+        chosen[name] = shown
     twice = sorted(repeated(chosen.get(agent, agent) for agent in known))
     require((len(chosen) == len(agents), "--agent names an agent twice; give each once"))
     require((not twice, f"--agent gives the name {', '.join(twice)} to two agents; choose different ones"))
     places = {agent: (place, name) for place, (agent, name) in enumerate(chosen.items())}
     found = []
     for (_, agent), by_seed in grouped(runs).items():
-        for run in present(by_seed):
-            found.append(replace(run, shown=places.get(agent)))
+        found += [replace(run, shown=places.get(agent)) for run in present(by_seed)]
     return found
 
 
@@ -117,15 +124,3 @@ def colours_of(runs: Sequence[Run], given: Sequence[str]) -> dict[str, str]:
         require((bool(name), f"--colour must be NAME=COLOUR, got {each!r}"), (not name or name in known, unknown))
         found[name] = colour
     return found
-
-
-def _choice(given: str, known: Sequence[str]) -> tuple[str, str]:
-    """Return an agent's name in tables and the one to show; settings in names have the sign of equality, too."""
-    if given in known:
-        return given, given
-    fits = [name for name in known if given.startswith(f"{name}=")]
-    name = max(fits, key=len, default="")
-    shown = given[len(name) + 1 :].strip()
-    unknown = f"--agent: there is no agent {given.partition('=')[0]!r}: {did_you_mean(given.partition('=')[0], known)}"
-    require((bool(fits), unknown), (not fits or bool(shown), f"--agent {given!r} must have a name after the sign"))
-    return name, shown

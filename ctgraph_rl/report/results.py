@@ -174,19 +174,14 @@ def selected(rows: Sequence[Row], names: Sequence[str] | None = None, also: Sequ
     Raises:
         ValueError: for a name that no row has.
     """
-    choices: dict[str, None] = {}
-    with_value = set()
-    for row in rows:
-        if row.measure != NO_RUN_FINISHED:
-            choices[row.kind] = None
-        if row.measure in WHERE_KNOWN and row.estimate.n:
-            with_value.add((row.curriculum, row.measure))
+    choices = dict.fromkeys(row.kind for row in rows if row.measure != NO_RUN_FINISHED)
     unknown = [name for name in names or () if name not in choices]
     require((not choices or not unknown, _no_measure(unknown, choices)))
+    known = {(row.curriculum, row.measure) for row in rows if row.measure in WHERE_KNOWN and row.estimate.n}
     found = []
     for row in rows:
         wanted = (*row.columns, "solved_rate", *also) if names is None else names
-        is_known = names is None and (row.curriculum, row.measure) in with_value
+        is_known = names is None and (row.curriculum, row.measure) in known
         if row.kind in (*wanted, NO_RUN_FINISHED) or is_known:
             found.append(row)
     return found
@@ -222,9 +217,8 @@ def write_tidy(path: Path, runs: Sequence[Run]) -> None:
     """
     logs = []
     for (_, agent), by_seed in grouped(runs).items():
-        for run in present(by_seed):
-            if run.history is not None:
-                logs.append((agent, str(run.path), RunLog.read(run.path / LOG)))
+        readable = [run for run in present(by_seed) if run.history is not None]
+        logs += [(agent, str(run.path), RunLog.read(run.path / LOG)) for run in readable]
     write_evaluations(path, logs)
 
 
@@ -362,17 +356,17 @@ def main() -> None:
 
 def _sentence(curriculum: str, first: str, second: str, found: Comparison, difference: float | None) -> str:
     record = f"better in {found.wins}, equal in {found.ties}, worse in {found.losses}"
-    sentence = f"{curriculum}: {first} - {second}: {found.difference}; {record}"
+    parts = [f"{curriculum}: {first} - {second}: {found.difference}", record]
     if found.p_value is not None:
-        sentence += f"; sign-flip p = {found.p_value:.3g}, Holm {found.holm:.3g}"
-        if found.holm is None or found.holm > 1 - statistics.LEVEL:
-            sentence += f": not distinguishable with {found.difference.n} seeds"
+        is_found = found.holm is not None and found.holm <= 1 - statistics.LEVEL
+        unclear = "" if is_found else f": not distinguishable with {found.difference.n} seeds"
+        parts.append(f"sign-flip p = {found.p_value:.3g}, Holm {found.holm:.3g}{unclear}")
         if found.needed is not None:
-            sentence += f"; {found.needed:,} would find such a difference with a chance of 80 %"
-    if difference is None or found.std is None:
-        return sentence
-    seeds = statistics.pairs_needed(difference, found.std)
-    return f"{sentence}; {seeds} seeds find a difference of {difference:g} with a chance of 80 %"
+            parts.append(f"{found.needed:,} would find such a difference with a chance of 80 %")
+    if difference is not None and found.std is not None:
+        seeds = statistics.pairs_needed(difference, found.std)
+        parts.append(f"{seeds} seeds find a difference of {difference:g} with a chance of 80 %")
+    return "; ".join(parts)
 
 
 if __name__ == "__main__":

@@ -58,14 +58,14 @@ class Estimate:
     """A number over seeds with its interval.
 
     Args:
-        value: the estimate; None without enough seeds.
+        value: None without enough seeds.
         low: lower end of the interval; None without one.
-        high: upper end of the interval.
+        high: upper end.
         n: seeds with a value.
         n_undefined: seeds without one.
-        method: what the value and the interval are.
+        method: what value and interval are.
         reason: why value or interval are missing, or why an interval of equal seeds is wide.
-        std: standard deviation over seeds, shown in place of an interval; None for other estimates.
+        std: standard deviation over seeds, shown in place of an interval.
 
     Raises:
         ValueError: for an interval without a value, with one end, or that its value is outside of.
@@ -81,12 +81,11 @@ class Estimate:
     std: float | None = None
 
     def __post_init__(self) -> None:
-        ends = (self.low, self.high)
-        if ends != (None, None):
-            has_all = None not in (self.value, *ends)
+        if (self.low, self.high) != (None, None):
+            has_all = None not in (self.low, self.value, self.high)
             holds = has_all and self.low <= self.value <= self.high  # type: ignore[operator]
-            interval = f"[{self.low}, {self.high}]"
-            require((holds, f"an interval must have two ends around its value, got {self.value} and {interval}"))
+            got = f"{self.value} and [{self.low}, {self.high}]"
+            require((holds, f"an interval must have two ends around its value, got {got}"))
 
     def __str__(self) -> str:
         """Value, interval and seeds, such as ``0.50 [0.25, 0.75] n = 9/10``, or ``0.50 ± 0.10 n = 10``."""
@@ -136,13 +135,12 @@ class Comparison:
 def mean(values: Values, level: float = LEVEL, bounds: LowHigh = UNBOUNDED) -> Estimate:
     """Return the mean with Gaffke's interval where both bounds are known, else with Student's.
 
-    One seed has no interval, nor have seeds that are all equal where a bound is not known.
+    One seed has no interval, nor have equal seeds where a bound is not known.
 
     Args:
         values: one per seed; None or NaN for a seed without.
         level: coverage of the interval.
-        bounds: the lowest and the highest value that a seed can have, see `Bounds`; noise widens them. A value outside
-            makes them none.
+        bounds: lowest and highest value of a seed, see `Bounds`; a value outside makes them none.
     """
     require(*fraction(level=level))
     known, missing = _known(values)
@@ -186,8 +184,6 @@ def constant(values: Values) -> Estimate:
 def mean_and_std(values: Values) -> Estimate:
     """Return the mean with the standard deviation over seeds, with n - 1 in its denominator.
 
-    A standard deviation says how much seeds differ. It is no interval of the mean.
-
     Args:
         values: one per seed; None or NaN for a seed without.
     """
@@ -205,9 +201,9 @@ def mean_and_std(values: Values) -> Estimate:
 def iqm(values: Sequence[Values], level: float = LEVEL, resamples: int = RESAMPLES, seed: int = 0) -> Estimate:
     """Return the interquartile mean with a stratified bootstrap, as rliable defines both (Agarwal et al. 2021).
 
-    The value is `scipy.stats.trim_mean` of a quarter at each side of all values of all tasks together. The interval has
-    the percentiles of `scipy.stats.bootstrap`, which draws the seeds of each task again, independently of other tasks.
-    Few seeds have intervals that cover less than they say; see `interquartile_mean`.
+    The value is `scipy.stats.trim_mean` of a quarter at each side of all values together. The interval has the
+    percentiles of `scipy.stats.bootstrap`, which draws the seeds of each task apart. With few seeds it covers less than
+    it says.
 
     Args:
         values: for each task, one value per seed; None or NaN for a seed without.
@@ -263,10 +259,9 @@ def solved_rate(solved: Sequence[bool | None], level: float = LEVEL) -> Estimate
 
 @takes_numbers
 def median_time(times: Values, level: float = LEVEL) -> Estimate:
-    """Return the median of times with the interval of its order statistics.
+    """Return the median of times, with the interval from the k-th smallest to the k-th largest.
 
-    The interval goes from the k-th smallest time to the k-th largest, with the largest k that keeps the level. Fewer
-    seeds than six have none at 95 %: theirs goes from 0 to infinity.
+    k is the largest that keeps the level. The interval of fewer than six seeds goes from 0 to infinity at 95 %.
 
     Args:
         times: one per seed, >= 0; infinite for a seed that never got there, None or NaN for one without result.
@@ -304,8 +299,8 @@ def interquartile_mean(
 ) -> Estimate:
     """Return the mean of the middle half of all values of all tasks, with a bootstrap stratified by task.
 
-    Seeds have random weights, others for each task; where bounds are known, one more value stands at them, as in
-    Gaffke's interval. Only from ten seeds on: with fewer the interval of unbounded values covers far less than it says.
+    Seeds have random weights, others for each task; one more value stands at known bounds, as in Gaffke's interval.
+    Fewer than ten seeds have no value: their interval would cover far less than it says.
 
     Args:
         values: for each task, one value per seed; None or NaN for a seed without.
@@ -375,7 +370,7 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
 
 
 def corrected(found: Mapping[Any, Comparison]) -> dict[Any, Comparison]:
-    """Return comparisons with their p-values corrected for the number of all, and the pairs that they need."""
+    """Return comparisons with corrected p-values and the pairs that they need."""
     p_values = holm([each.p_value for each in found.values()])
     count = sum(p is not None for p in p_values)
     complete = {}
@@ -393,8 +388,8 @@ def corrected(found: Mapping[Any, Comparison]) -> dict[Any, Comparison]:
 def pairs_needed(difference: float, std: float, comparisons: int = 1, level: float = LEVEL) -> int:
     """Return with how many pairs `compare` finds a difference with a chance of 80 %.
 
-    They are those of `seeds_needed`, and so many that the test can find anything: its smallest p-value is 2 / 2^n, 0.03
-    with six pairs. Both are corrected for the number of comparisons (Bonferroni).
+    They are those of `seeds_needed`, and so many that the test can find anything: its smallest p-value is 2 / 2^n. Both
+    are corrected for the number of comparisons (Bonferroni).
 
     Args:
         difference: true difference of means, other than 0.
@@ -448,7 +443,7 @@ def _nothing(missing: int, method: str, reason: str = "no seed has a value") -> 
 
 
 def _of_tasks(values: Sequence[Values], who: str, level: float, resamples: int) -> tuple[list[list[float]], int, int]:
-    """Return the values of each task, and the numbers of seeds with and without one; refuse what is out of range."""
+    """Return the values of each task, and the least seeds with and the most without one."""
     require(*fraction(level=level), (is_int(resamples, 100), f"resamples must be an integer >= 100, got {resamples!r}"))
     require((len(values) > 0, f"{who} needs the values of at least one task"))
     known, missing = zip(*map(_known, values), strict=True)
@@ -462,7 +457,7 @@ def _checked(bounds: LowHigh) -> Bounds:
 
 
 def _sign_flip(differences: Sequence[float]) -> float:
-    """Two-sided p-value of the sum under all flips of signs, or under many random ones and the one found."""
+    """Return the two-sided p-value of the sum under all flips of signs, or under many random ones."""
     count = len(differences)
     if count <= MOST_FLIPPED:
         signs = np.array(list(product((1, -1), repeat=count)))

@@ -66,9 +66,8 @@ def draw_matrices(section: Section, result: Result) -> Any:
 def draw_performance(axes: Any, matrix: Estimates, labels: Sequence[str], trained: Sequence[Sequence[int]]) -> None:
     """The performance matrix on a scale from 0, or the lowest value, to 1, or the highest; row 0 is untrained."""
     values = _values(matrix)
-    image = _show(axes, values, "viridis", np.nanmin(values, initial=0.0), np.nanmax(values, initial=1.0))
-    _name(axes, labels, len(matrix), 0)
-    _write(axes, matrix, image, "")
+    scale = (np.nanmin(values, initial=0.0), np.nanmax(values, initial=1.0))
+    _draw(axes, matrix, "viridis", scale, labels)
     _box(axes, trained, 1)
     axes.set(ylabel="after block", title="mean return on each task")
 
@@ -77,9 +76,7 @@ def draw_transfer(axes: Any, matrix: Estimates, labels: Sequence[str], trained: 
     """Changes of return, centred on zero; a dash marks losses where cells have no numbers, for grey prints."""
     values = _values(matrix)
     largest = np.nanmax(abs(values), initial=0.0) or 1.0
-    image = _show(axes, values, "PuOr", -largest, largest)
-    _name(axes, labels, len(matrix), 1)
-    _write(axes, matrix, image, "+")
+    _draw(axes, matrix, "PuOr", (-largest, largest), labels, first=1)
     if len(labels) > MOST_NUMBERS:
         blocks, tasks = np.nonzero(values < NEGATIVE * largest)
         axes.plot(tasks, blocks, marker="_", linestyle="", color="black")
@@ -92,36 +89,44 @@ def _values(matrix: Estimates) -> np.ndarray:
     return np.array([[cell.value for cell in row] for row in matrix], dtype=np.float64, ndmin=2)
 
 
-def _show(axes: Any, values: np.ndarray, colours: str, low: float, high: float) -> Any:
-    """Draw the cells, with a scale beside them; what has no value is grey."""
+def _draw(
+    axes: Any,
+    matrix: Estimates,
+    colours: str,
+    scale: tuple[float, float],
+    labels: Sequence[str],
+    first: int = 0,
+) -> None:
+    """Draw the cells, grey where there is no value, with means and intervals where there is room.
+
+    Args:
+        axes: where they go.
+        matrix: rows of estimates; from block 1 on they are changes, and have a sign.
+        colours: name of a colour map.
+        scale: its lowest and highest value.
+        labels: of the tasks.
+        first: number of the first row's block.
+    """
     axes.set_facecolor(NO_VALUE)
+    values = _values(matrix)
     cells = values if values.size else [[math.nan]]
-    image = axes.imshow(cells, cmap=colours, vmin=low, vmax=high, aspect="auto", interpolation="none")
+    image = axes.imshow(cells, cmap=colours, vmin=scale[0], vmax=scale[1], aspect="auto", interpolation="none")
     axes.figure.colorbar(image, ax=axes, shrink=0.9, pad=0.02)
     axes.spines[:].set_visible(False)
-    return image
-
-
-def _name(axes: Any, labels: Sequence[str], rows: int, first: int) -> None:
     if len(labels) <= MOST_NAMES:
         upright = 90 if len(labels) > MOST_NUMBERS else 30
         side = "center" if upright == 90 else "right"
         axes.set_xticks(range(len(labels)), map(short, labels), rotation=upright, ha=side, rotation_mode="default")
     else:
         axes.set_xlabel("task, counted from 0")
-    step = 1 + rows // 20
-    axes.set_yticks(range(0, rows, step), range(first, first + rows, step))
+    step = 1 + len(matrix) // 20
+    axes.set_yticks(range(0, len(matrix), step), range(first, first + len(matrix), step))
     axes.tick_params(length=0)
-
-
-def _write(axes: Any, matrix: Estimates, image: Any, sign: str) -> None:
-    """Write each mean into its cell, with its interval where there is room."""
     tasks = len(matrix[0]) if matrix else 0
-    if tasks > MOST_NUMBERS:
-        return
-    for i, row in enumerate(matrix):
+    for i, row in enumerate(matrix if tasks <= MOST_NUMBERS else ()):
         for j, cell in enumerate(row):
             colour = ink(NO_VALUE if cell.value is None else image.to_rgba(cell.value)[:3])
+            sign = "+" if first else ""
             words = "-" if cell.value is None else f"{cell.value:{sign}.2f}" if cell.value else "0"
             if cell.low is not None and cell.high is not None and tasks <= MOST_INTERVALS:
                 words += f"\n[{cell.low:.2f}, {cell.high:.2f}]"

@@ -16,6 +16,7 @@ from studies.raw import HERE, TEMPLATES, Raw, groups, machines, numbers_in, read
 from studies.verdicts import (
     AGREES,
     DISAGREES,
+    MOST_SEEDS,
     UNKNOWN,
     VERDICTS,
     Effect,
@@ -149,7 +150,8 @@ class Row:
             return f"**{self.verdict}**"
         if effect.room < effect.counts:
             return f"**{UNKNOWN}**: no room for an effect"
-        return f"**{UNKNOWN}**: {len(effect.values)} seeds; {effect.seeds} would do"
+        enough = f"fewer than {MOST_SEEDS} would not do" if effect.seeds is None else f"{effect.seeds} would do"
+        return f"**{UNKNOWN}**: {len(effect.values)} seeds; {enough}"
 
     def cells(self) -> list[str]:
         """The cells of the table."""

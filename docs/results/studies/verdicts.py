@@ -87,12 +87,17 @@ class Effect:
         return fmean(moved(most))
 
     @property
-    def seeds(self) -> int:
-        """Seeds that would see the smallest effect that counts: with this spread, and if all had just this effect."""
-        equal = next(n for n in range(2, MOST_SEEDS) if _sees_equal(self.counts, n, self.bounds))
+    def seeds(self) -> int | None:
+        """Seeds that would see the smallest effect that counts: with this spread, and if all had just this effect.
+
+        None where fewer than `MOST_SEEDS` that all had this effect would not see it.
+        """
+        equal = next((n for n in range(2, MOST_SEEDS) if _sees_equal(self.counts, n, self.bounds)), None)
         known = [value for value in self.values if value is not None]
         spread = statistics.compare(known, [0.0] * len(known)).std
-        return max(equal, statistics.seeds_needed(self.counts, spread, paired=True)) if spread else equal
+        if equal is None or not spread:
+            return equal
+        return max(equal, statistics.seeds_needed(self.counts, spread, paired=True))
 
 
 def _sees_equal(effect: float, n: int, bounds: tuple[float, float]) -> bool:

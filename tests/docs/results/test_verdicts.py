@@ -65,6 +65,7 @@ def test_more_seeds_would_do_where_they_differ_more():
     assert statistics.mean([0.5] * equal.seeds, bounds=(-1, 1)).low > 0
     assert statistics.mean([0.5] * (equal.seeds - 1), bounds=(-1, 1)).low <= 0
     assert spread.seeds > equal.seeds
+    assert Effect((0.3,) * 4, counts=0.01, room=1.0).seeds is None  # 199 seeds that all had it would not see it
 
 
 def test_a_time_that_was_not_reached_is_later_than_all_that_were():
