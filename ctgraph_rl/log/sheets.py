@@ -80,17 +80,16 @@ def to_markdown(sheet: Sheet) -> str:
 
 def to_latex(sheet: Sheet) -> str:
     """A table in LaTeX, for the package booktabs; title and notes as comments."""
-    sides = [_latex_side(i, side, sheet.rows) for i, side in enumerate(sheet.columns.values())]
+    sides = []
+    for i, side in enumerate(sheet.columns.values()):
+        is_wide = any(len(row[i]) > WIDE for row in sheet.rows)
+        sides.append(r"p{0.6\linewidth}" if is_wide else side)
     header = " & ".join(MATHS.get(name, latex_text(name)) for name in sheet.columns)
     lines = [" & ".join(map(latex_text, row)) + r" \\" for row in sheet.rows]
     notes = [f"% {terminal_text(line)}" for line in (sheet.title, *sheet.notes)]
     begin = rf"\begin{{tabular}}{{{''.join(sides)}}}"
     end = r"\end{tabular}"
     return "\n".join([*notes, begin, r"\toprule", header + r" \\", r"\midrule", *lines, r"\bottomrule", end, ""])
-
-
-def _latex_side(column: int, side: str, rows: Sequence[Sequence[str]]) -> str:
-    return r"p{0.6\linewidth}" if any(len(row[column]) > WIDE for row in rows) else side
 
 
 FORMATS: dict[str, Callable[[Sheet], str]] = {"markdown": to_markdown, "latex": to_latex}

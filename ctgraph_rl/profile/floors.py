@@ -58,7 +58,9 @@ def decisions_by_step(task: Task) -> tuple[float, tuple[int, ...]]:
 @cache
 def _best_by_step(branching_factor: int, wait_prob: float, goal: tuple[int, ...]) -> tuple[float, tuple[int, ...]]:
     source = random.Random(0)
-    num_steps = _long_enough(wait_prob, len(goal))
+    num_steps = 2 * len(goal) + 2
+    if wait_prob:  # until almost no episode still waits for a decision
+        num_steps += len(goal) * math.ceil(math.log(NEGLIGIBLE) / math.log(wait_prob))
     best: tuple[float, tuple[int, ...]] = (-1.0, ())
     for _ in range(STARTS):
         decisions = [source.randint(1, branching_factor) for _ in range(num_steps)]
@@ -67,13 +69,6 @@ def _best_by_step(branching_factor: int, wait_prob: float, goal: tuple[int, ...]
             value = improved
         best = max(best, (round(value, 6), tuple(decisions)))
     return best
-
-
-def _long_enough(wait_prob: float, depth: int) -> int:
-    """Return steps after which almost no episode still waits for a decision."""
-    if wait_prob == 0:
-        return 2 * depth + 2
-    return 2 * depth + 2 + depth * math.ceil(math.log(NEGLIGIBLE) / math.log(wait_prob))
 
 
 def _improve(decisions: list[int], wait_prob: float, goal: tuple[int, ...]) -> float:

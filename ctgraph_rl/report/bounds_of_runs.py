@@ -114,7 +114,11 @@ def bounds_of_curriculum(curriculum: Curriculum, evaluations: int = 1) -> Bounds
     whole = _around(of_evaluation)
     of_tasks = of_evaluation[: len(curriculum.tasks)]
     shares = _shares(curriculum.tasks, of_tasks)
-    regrets = _search_regrets(tasks, evaluation)
+    regrets = UNBOUNDED
+    if are_graphs(tasks):
+        episodes = evaluation.row_episodes
+        exact = [exact_search(task.graph.num_end_states, episodes).sum().item() for task in tasks]
+        regrets = Bounds(min(exact) - episodes, max(exact))  # goals that a row misses beside the best search
     known = Known(*whole, len(of_tasks), evaluations, *shares, *regrets)
     returns = dict(zip(curriculum.labels, of_tasks, strict=True))
     alike = evaluation.greedy and are_graphs(curriculum.tasks) and all(t.is_deterministic for t in curriculum.tasks)
@@ -123,15 +127,6 @@ def bounds_of_curriculum(curriculum: Curriculum, evaluations: int = 1) -> Bounds
 
 def _around(bounds: Sequence[Bounds]) -> Bounds:
     return Bounds(min(each.low for each in bounds), max(each.high for each in bounds))
-
-
-def _search_regrets(tasks: Sequence[TaskLike], evaluation: Evaluation) -> Bounds:
-    """Return the bounds of the goals that a row of any task misses beside the best search."""
-    if not are_graphs(tasks):
-        return UNBOUNDED
-    episodes = evaluation.row_episodes
-    exact = [exact_search(task.graph.num_end_states, episodes).sum().item() for task in tasks]
-    return Bounds(min(exact) - episodes, max(exact))
 
 
 def _shares(tasks: Sequence[TaskLike], returns: Sequence[Bounds]) -> Bounds:

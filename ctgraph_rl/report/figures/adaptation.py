@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import chain
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -29,14 +28,8 @@ def adaptation_curves(section: Section) -> CaptionedFigure | None:
         "trained and held-out ones apart; thin lines: single seeds, thick ones: their means. Dashed: the best search "
         f"for a goal that is drawn uniformly.{left_out(len(section.results), MOST_AGENTS, 'agents')}"
     )
-    return CaptionedFigure("adaptation", "Adaptation", caption, draw_adaptation(section, kinds))
-
-
-def draw_adaptation(section: Section, kinds: list[str]) -> Any:
-    """Draw a panel for trained tasks, and one for held-out ones."""
     figure = new_figure(max(WIDTHS["column"], figure_width() * len(kinds) / len(KINDS)), 2.6)
     panels = figure.subplots(1, len(kinds), squeeze=False, sharey=True)[0]
-    shown = section.results[:MOST_AGENTS]
     for axes, kind in zip(panels, kinds, strict=True):
         for position, result in enumerate(shown):
             look = agent_style(position, result.agent)
@@ -52,7 +45,7 @@ def draw_adaptation(section: Section, kinds: list[str]) -> Any:
     panels[0].set_ylabel("share at the goal")
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", ncols=min(beside(3), len(labels)))
-    return figure
+    return CaptionedFigure("adaptation", "Adaptation", caption, figure)
 
 
 def _of_seeds(result: Result, kind: str) -> list[Adaptation]:

@@ -118,12 +118,7 @@ def profiles(section: Section) -> CaptionedFigure | None:
         "Performance profiles: the share of runs and tasks whose mean return at the last evaluation is above a "
         f"threshold. Bands: {BOOTSTRAP}.{left_out(len(shown), MOST_AGENTS, 'agents')}"
     )
-    return CaptionedFigure("profiles", "Performance profiles", caption, draw_profiles(section))
-
-
-def draw_profiles(section: Section) -> Any:
-    """Draw the performance profile of each agent."""
-    shown = _shown(section)[:MOST_AGENTS]
+    shown = shown[:MOST_AGENTS]
     every = np.concatenate([_pooled(scores(result)) for result in shown])
     thresholds = np.linspace(min(0.0, every.min()), max(1.0, every.max()), THRESHOLDS)
     figure = new_figure(figure_width(), 2.5)
@@ -135,7 +130,7 @@ def draw_profiles(section: Section) -> Any:
         axes.fill_between(thresholds, profile.low, profile.high, color=look["color"], alpha=0.18, linewidth=0)
     axes.set(xlabel="threshold of the return", ylabel="share of runs above", ylim=(-0.03, 1.03))
     figure.legend(loc="outside upper left", ncols=min(beside(3), len(shown)))
-    return figure
+    return CaptionedFigure("profiles", "Performance profiles", caption, figure)
 
 
 def improvements(section: Section) -> CaptionedFigure | None:
@@ -148,12 +143,7 @@ def improvements(section: Section) -> CaptionedFigure | None:
         "than a run of the other, as a mean over tasks. Equal returns count half, so equal agents have 0.5. Bars: "
         f"{BOOTSTRAP}.{left_out(len(shown), MOST_AGENTS, 'agents')}"
     )
-    return CaptionedFigure("improvement", "Probability of improvement", caption, draw_improvements(section))
-
-
-def draw_improvements(section: Section) -> Any:
-    """Draw a bar for each pair of agents: the interval, with a line at the estimate."""
-    pairs = list(combinations(_shown(section)[:MOST_AGENTS], 2))
+    pairs = list(combinations(shown[:MOST_AGENTS], 2))
     figure = new_figure(figure_width(), 0.8 + 0.36 * len(pairs))
     axes = figure.subplots()
     for row, (first, second) in enumerate(pairs):
@@ -166,4 +156,4 @@ def draw_improvements(section: Section) -> Any:
     axes.invert_yaxis()
     axes.axvline(0.5, color="0.4", linestyle="--", linewidth=0.8)
     axes.set(xlim=(-0.02, 1.02), xlabel="P(a run of the first is better)")
-    return figure
+    return CaptionedFigure("improvement", "Probability of improvement", caption, figure)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, left_out
 from ctgraph_rl.report.figures.learning_curves import BANDS, draw_means
@@ -27,14 +26,8 @@ def experiments(found: Sequence[Section]) -> CaptionedFigure | None:
         "Mean return over all tasks of each curriculum at its evaluations, over the frames learned from. Lines: means "
         f"over seeds; bands: {BANDS}; thin lines: single seeds. Dashed: ends of blocks.{cut}"
     )
-    return CaptionedFigure("experiments", "All experiments", caption, draw_experiments(measured))
-
-
-def draw_experiments(found: Sequence[Section]) -> Any:
-    """Draw a panel for each curriculum; an agent has one colour in all of them."""
-    shown = found[:MOST_EXPERIMENTS]
-    agents = _agents(shown)[:MOST_AGENTS]
-    looks = {agent: agent_style(position, agent) for position, agent in enumerate(agents)}
+    shown = measured[:MOST_EXPERIMENTS]
+    looks = {agent: agent_style(position, agent) for position, agent in enumerate(_agents(shown)[:MOST_AGENTS])}
     grid = panels(len(shown), COLUMNS, 1.7, sharey=True)
     figure = grid[0, 0].figure
     for axes, section in zip(grid.ravel(), shown, strict=False):
@@ -45,7 +38,7 @@ def draw_experiments(found: Sequence[Section]) -> Any:
         row[0].set_ylabel("mean return")
     figure.supxlabel("frames", fontsize=8)
     agents_legend(figure, list(zip(map(short, looks), looks.values(), strict=True)))
-    return figure
+    return CaptionedFigure("experiments", "All experiments", caption, figure)
 
 
 def _agents(found: Sequence[Section]) -> list[str]:

@@ -69,7 +69,12 @@ class Gallery:
         """Draw and write figures, skipping None; their file names start with ``names``."""
         written = []
         with style(self.width, self.colours):
-            for one in filter(None, map(self._counted, figures)):
+            for one in figures:
+                self._done += 1
+                if self._count is not None:
+                    self._count(self._done)
+                if one is None:
+                    continue
                 path = f"{FOLDER}/{self._stem(*names, one.kind)}"
                 png = picture(one.figure, "png")
                 one.figure.set_layout_engine("none")  # its work is done, and is most of the time of a figure
@@ -77,12 +82,6 @@ class Gallery:
                 write_whole(self.folder / f"{path}.pdf", picture(one.figure, "pdf"))
                 written.append(Written(f"{path}.png", one.title, one.caption, base64.b64encode(png).decode()))
         return written
-
-    def _counted(self, figure: CaptionedFigure | None) -> CaptionedFigure | None:
-        self._done += 1
-        if self._count is not None:
-            self._count(self._done)
-        return figure
 
     def _stem(self, *names: str) -> str:
         """A new name for a file, of letters that every system takes."""

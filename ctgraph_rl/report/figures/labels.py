@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from ctgraph_rl.learn.labels import Span
@@ -38,12 +38,7 @@ def label_strips(section: Section) -> CaptionedFigure | None:
         "is played with the label that acted in most of its frames: an oracle only in evaluation, which no learner "
         "sees."
     )
-    return CaptionedFigure("labels", "Labels and true tasks", caption, draw_labels(section))
-
-
-def draw_labels(section: Section) -> Any:
-    """Draw a strip for the true tasks and one for each run."""
-    runs = _runs(section)[:MOST_STRIPS]
+    runs = runs[:MOST_STRIPS]
     figure = new_figure(figure_width(), 0.7 + 0.24 * (len(runs) + 1))
     axes = figure.subplots()
     blocks = list(zip(section.ends, section.ends[1:], section.trained, strict=False))
@@ -51,23 +46,29 @@ def draw_labels(section: Section) -> Any:
         text = ",".join(str(task + 1) for task in tasks)
         _part(axes, 0, (start, end), text, colour=_colour(tasks[0] if len(tasks) == 1 else None), room=section.ends[-1])
     for row, (_, run) in enumerate(runs, 1):
-        spans = run.history.spans if run.history else ()
-        _draw_strip(axes, row, spans, blocks, room=section.ends[-1])
+        assert run.history is not None
+        _draw_strip(axes, row, run.history.spans, blocks, room=section.ends[-1])
     for start, _, tasks in blocks[1:]:
         if tasks != next(before for _, end, before in blocks if end == start):
             axes.axvline(start, color="black", linestyle=(0, (3, 2)), linewidth=0.6)
-    names = ["true task"]
-    for name, _ in runs:
-        names.append(figure_text(name))
+    names = ["true task", *(figure_text(name) for name, _ in runs)]
     axes.set(xlim=(0, max(section.ends[-1], 1)), ylim=(len(runs) + 0.6, -0.6), xlabel="frames")
     axes.set_yticks(range(len(names)), names)
     axes.tick_params(axis="y", length=0)
     frames_axis(axes)
-    return figure
+    return CaptionedFigure("labels", "Labels and true tasks", caption, figure)
 
 
 def _draw_strip(axes: Any, row: int, spans: Sequence[Span], blocks: Sequence[Any], room: float) -> None:
-    of_label = dict(_tasks_of_labels(spans, blocks))
+    of_label = {}
+    for label, own in split_by(spans, lambda span: span.label).items():
+        frames: dict[int, float] = {}
+        for start, end, tasks in blocks:
+            if len(tasks) == 1:
+                shared = sum(max(0, min(end, span.end) - max(start, span.start)) for span in own)
+                frames[tasks[0]] = frames.get(tasks[0], 0) + shared
+        if any(frames.values()):
+            of_label[label] = max(frames, key=lambda task: frames[task])  # in most of whose frames it acted
     for span in spans:
         colour = _colour(of_label.get(span.label))
         opacity = 1.0 if span.learned else NOT_LEARNED
@@ -106,15 +107,3 @@ def _colour(task: int | None) -> tuple[float, float, float]:
         return SEVERAL
     red, green, blue, _ = colormaps["viridis"]((task % shades * 3 % shades + 0.5) / shades)
     return red, green, blue
-
-
-def _tasks_of_labels(spans: Sequence[Span], blocks: Sequence[Any]) -> Iterator[tuple[int, int]]:
-    """Yield each label with the task in most of whose frames it acted, of blocks that train one task."""
-    for label, own in split_by(spans, lambda span: span.label).items():
-        frames: dict[int, float] = {}
-        for start, end, tasks in blocks:
-            if len(tasks) == 1:
-                shared = sum(max(0, min(end, span.end) - max(start, span.start)) for span in own)
-                frames[tasks[0]] = frames.get(tasks[0], 0) + shared
-        if any(frames.values()):
-            yield label, max(frames, key=lambda task: frames[task])

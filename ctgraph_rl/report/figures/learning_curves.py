@@ -46,7 +46,7 @@ PLACES = 160
 
 
 def learning_curves(section: Section) -> CaptionedFigure | None:
-    """Return the curves of all agents at evaluations; None without a finished run."""
+    """Return the curves of all agents at evaluations, a panel for each task; None without a finished run."""
     if not section.finished:
         return None
     tasks = left_out(len(section.labels), MOST_TASKS, "tasks")
@@ -55,40 +55,6 @@ def learning_curves(section: Section) -> CaptionedFigure | None:
         f"means over seeds, where all have a value; bands: {BANDS}; thin lines: single seeds, up to {MOST_SEEDS}. "
         "Grey: blocks that train the task; dashed: ends of blocks."
     )
-    return CaptionedFigure("curves", "Learning curves", caption, draw_tasks(section))
-
-
-def mean_curves(section: Section) -> CaptionedFigure | None:
-    """Return the mean return over all tasks of all agents at evaluations; None without a finished run."""
-    if not section.finished:
-        return None
-    caption = (
-        f"Mean return over all {len(section.labels)} tasks at every evaluation of all of them, over the frames learned "
-        f"from. {_agents(section)} Lines: means over seeds, where all have a value; bands: {BANDS}; thin lines: single "
-        f"seeds, up to {MOST_SEEDS}. Dashed: ends of blocks."
-    )
-    return CaptionedFigure("mean", "Mean return over all tasks", caption, draw_mean(section))
-
-
-def training_curves(section: Section) -> CaptionedFigure | None:
-    """Return the return while training of all agents; None where no run measured it."""
-    if not has_training(section):
-        return None
-    caption = (
-        f"Return of the episodes that were finished while training, means over equal numbers of frames. "
-        f"{_agents(section)} Lines: means over seeds; bands: {BANDS}; thin lines: single seeds, of fewer. Dashed: ends "
-        "of blocks."
-    )
-    return CaptionedFigure("training", "Return while training", caption, draw_training(section))
-
-
-def _agents(section: Section) -> str:
-    shown = ", ".join(f"{result.agent} (n = {result.n})" for result in section.results[:MOST_AGENTS])
-    return f"Agents: {shown}.{left_out(len(section.results), MOST_AGENTS, 'agents')}"
-
-
-def draw_tasks(section: Section) -> Any:
-    """Draw a panel for each task: mean return at all evaluations of each agent, with its interval and its seeds."""
     labels = section.labels[:MOST_TASKS]
     width = min(max(0.5, len(labels) / beside(COLUMNS)), 1)
     grid = panels(len(labels), COLUMNS, 1.45, width, sharex=True, sharey=True)
@@ -100,30 +66,34 @@ def draw_tasks(section: Section) -> Any:
             points = evaluation_curve(result.finished, label, result.bounds.of_task(label))
             _draw(axes, look, [points], seeds if len(seeds) <= MOST_SEEDS else [])
         axes.set_title(short(label))
-    return _finished(grid, section, "mean return")
+    return CaptionedFigure("curves", "Learning curves", caption, _finished(grid, section, "mean return"))
 
 
-def draw_mean(section: Section) -> Any:
-    """Draw the mean return over all tasks, a curve for each agent."""
+def mean_curves(section: Section) -> CaptionedFigure | None:
+    """Return the mean return over all tasks of all agents at evaluations; None without a finished run."""
+    if not section.finished:
+        return None
+    caption = (
+        f"Mean return over all {len(section.labels)} tasks at every evaluation of all of them, over the frames learned "
+        f"from. {_agents(section)} Lines: means over seeds, where all have a value; bands: {BANDS}; thin lines: single "
+        f"seeds, up to {MOST_SEEDS}. Dashed: ends of blocks."
+    )
     grid = panels(1, 1, 2.3, room=0)
-    [[axes]] = grid
     shown = section.results[:MOST_AGENTS]
-    draw_means(axes, section, {result.agent: agent_style(i, result.agent) for i, result in enumerate(shown)})
-    return _finished(grid, section, "mean return over all tasks")
+    draw_means(grid[0, 0], section, {result.agent: agent_style(i, result.agent) for i, result in enumerate(shown)})
+    figure = _finished(grid, section, "mean return over all tasks")
+    return CaptionedFigure("mean", "Mean return over all tasks", caption, figure)
 
 
-def draw_means(axes: Any, section: Section, looks: Mapping[str, dict[str, Any]]) -> None:
-    """Draw the mean return over all tasks of a section's agents that have a look."""
-    _mark_blocks(axes, section, None)
-    for result in section.results:
-        if result.agent in looks:
-            seeds = list(filter(None, map(mean_curve, histories(result.finished))))
-            points = over_seeds(seeds, result.bounds.of_returns)
-            _draw(axes, looks[result.agent], [points], seeds if len(seeds) <= MOST_SEEDS else [])
-
-
-def draw_training(section: Section) -> Any:
-    """Draw the return while training over all blocks, a curve for each agent."""
+def training_curves(section: Section) -> CaptionedFigure | None:
+    """Return the return while training of all agents over all blocks; None where no run measured it."""
+    if not any(history.training for history in histories(section.finished)):
+        return None
+    caption = (
+        f"Return of the episodes that were finished while training, means over equal numbers of frames. "
+        f"{_agents(section)} Lines: means over seeds; bands: {BANDS}; thin lines: single seeds, of fewer. Dashed: ends "
+        "of blocks."
+    )
     grid = panels(1, 1, 2.3, room=0)
     [[axes]] = grid
     _mark_blocks(axes, section, None)
@@ -136,7 +106,8 @@ def draw_training(section: Section) -> Any:
             for piece in _training(replace(result, by_seed={run.seed: run}), blocks, places):
                 seeds += [[(point.frames, point.value) for point in piece]] if piece else []
         _draw(axes, agent_style(position, result.agent), pieces, seeds)
-    return _finished(grid, section, "return while training")
+    figure = _finished(grid, section, "return while training")
+    return CaptionedFigure("training", "Return while training", caption, figure)
 
 
 def _training(result: Result, blocks: Sequence[tuple[int, tuple[int, int]]], places: int) -> list[list[Point]]:
@@ -147,9 +118,19 @@ def _training(result: Result, blocks: Sequence[tuple[int, tuple[int, int]]], pla
     return curves
 
 
-def has_training(section: Section) -> bool:
-    """Return whether any run measured its return while training."""
-    return any(history.training for history in histories(section.finished))
+def draw_means(axes: Any, section: Section, looks: Mapping[str, dict[str, Any]]) -> None:
+    """Draw the mean return over all tasks of a section's agents that have a look."""
+    _mark_blocks(axes, section, None)
+    for result in section.results:
+        if result.agent in looks:
+            seeds = list(filter(None, map(mean_curve, histories(result.finished))))
+            points = over_seeds(seeds, result.bounds.of_returns)
+            _draw(axes, looks[result.agent], [points], seeds if len(seeds) <= MOST_SEEDS else [])
+
+
+def _agents(section: Section) -> str:
+    shown = ", ".join(f"{result.agent} (n = {result.n})" for result in section.results[:MOST_AGENTS])
+    return f"Agents: {shown}.{left_out(len(section.results), MOST_AGENTS, 'agents')}"
 
 
 def _mark_blocks(axes: Any, section: Section, task: int | None) -> None:

@@ -19,8 +19,8 @@ from matplotlib.colors import to_rgb
 
 from ctgraph_rl.report.figures import heatmaps
 from ctgraph_rl.report.figures.heatmaps import draw_matrices
-from ctgraph_rl.report.figures.labels import draw_labels, label_strips
-from ctgraph_rl.report.figures.learning_curves import draw_mean, draw_tasks, training_curves
+from ctgraph_rl.report.figures.labels import label_strips
+from ctgraph_rl.report.figures.learning_curves import learning_curves, mean_curves, training_curves
 from ctgraph_rl.report.style import contrast, ink, style
 from ctgraph_rl.report.terminal import label_notes
 
@@ -75,10 +75,10 @@ def test_each_number_is_written_in_the_ink_of_its_own_cell(section):
         assert len(axes.texts) == image.get_array().size
 
 
-@pytest.mark.parametrize("draw", [draw_mean, draw_tasks])
+@pytest.mark.parametrize("draw", [mean_curves, learning_curves])
 def test_no_marker_is_cut_at_the_edge_of_its_panel(section, draw):
     with style():
-        figure = draw(section)
+        figure = draw(section).figure
         FigureCanvasAgg(figure).draw()
 
     for axes in figure.axes:
@@ -104,7 +104,7 @@ def test_the_mean_over_all_tasks_is_of_evaluations_of_all_of_them(section):
 
 def test_few_seeds_are_thin_lines_beside_their_mean_and_no_band(section):
     with style():
-        (axes,) = draw_mean(section).axes
+        (axes,) = mean_curves(section).figure.axes
 
     widths = sorted(line.get_linewidth() for line in axes.lines if line.get_linestyle() == "-")
 
@@ -119,7 +119,7 @@ def test_labels_are_drawn_over_the_frames_in_which_they_acted_in_the_colour_of_t
     section = sections(find_runs([tmp_path])[0])[0]
 
     with style():
-        figure = draw_labels(section)
+        figure = label_strips(section).figure
     (axes,) = figure.axes
 
     bars = [(*bar.get_xy(), bar.get_width(), bar.get_facecolor()) for bar in axes.patches]

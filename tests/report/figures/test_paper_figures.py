@@ -12,16 +12,14 @@ from ctgraph_rl.draw.style import picture
 from ctgraph_rl.report import __main__ as command
 from ctgraph_rl.report import page
 from ctgraph_rl.report.figures.aggregates import (
-    draw_improvements,
-    draw_profiles,
     improvements,
     performance_profile,
     probability_of_improvement,
     profiles,
 )
-from ctgraph_rl.report.figures.experiments import draw_experiments, experiments
+from ctgraph_rl.report.figures.experiments import experiments
 from ctgraph_rl.report.figures.gallery import Gallery
-from ctgraph_rl.report.figures.learning_curves import draw_mean
+from ctgraph_rl.report.figures.learning_curves import mean_curves
 from ctgraph_rl.report.sections import sections
 from ctgraph_rl.report.style import style
 
@@ -65,7 +63,7 @@ def test_the_probability_of_improvement_is_the_mean_of_mann_whitney_over_tasks()
 
 def test_agents_of_enough_seeds_have_both_figures(found):
     with style("column"):
-        profile, improvement = draw_profiles(found[0]), draw_improvements(found[0])
+        profile, improvement = profiles(found[0]).figure, improvements(found[0]).figure
 
     assert [len(line.get_xdata()) for line in profile.axes[0].lines] == [101, 101]
     assert [text.get_text() for text in improvement.axes[0].get_yticklabels()] == ["DQN\nover PPO"]
@@ -76,7 +74,7 @@ def test_agents_of_enough_seeds_have_both_figures(found):
 
 def test_several_experiments_are_panels_of_one_figure_with_one_colour_an_agent(found):
     with style(colours={"DQN": "#123456"}):
-        figure = draw_experiments(found)
+        figure = experiments(found).figure
 
     assert [axes.get_title() for axes in figure.axes] == ["two", "other"]
     colours = [{line.get_color() for line in axes.lines if len(line.get_xdata()) > 2} for axes in figure.axes]
@@ -87,13 +85,13 @@ def test_several_experiments_are_panels_of_one_figure_with_one_colour_an_agent(f
 
 def test_a_figure_of_a_column_is_narrow_and_has_its_fonts_within(found):
     with style("column"):
-        figure = draw_mean(found[0])
+        figure = mean_curves(found[0]).figure
         pdf = picture(figure, "pdf")
 
     assert figure.get_figwidth() == 3.5
     assert b"/FontFile2" in pdf and b"/Type3" not in pdf
     with style():
-        assert draw_mean(found[0]).get_figwidth() == 7.2
+        assert mean_curves(found[0]).figure.get_figwidth() == 7.2
 
 
 def test_the_report_has_the_width_and_the_colours_that_are_asked_for(tmp_path, monkeypatch):
