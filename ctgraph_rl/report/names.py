@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from ctgraph_rl.checks import did_you_mean, repeated, require
 from ctgraph_rl.report.bounds_of_runs import curriculum_of, published
 from ctgraph_rl.runs.read import MODIFIED, Run, by_curriculum, grouped, present
-from ctgraph_rl.tasks.curriculum import Curriculum
 
 NOT_COMPARED = ("name", "source", "fingerprint", "schema", "about")
 """Keys of a curriculum's JSON that do not change what is learned."""
@@ -34,44 +33,34 @@ def modification(run: Run) -> str:
         return ""
     learned = curriculum_of(run)
     original = published(run.group[0])
-    return "" if learned is None or original is None else ", ".join(_changes(original, learned))
-
-
-def _changes(published: Curriculum, learned: Curriculum) -> Iterator[str]:
-    """Yield the settings that differ, such as ``blocks.num_frames=8192 instead of 51200``."""
-    before = _settings(published.to_json())
-    now = _settings(learned.to_json())
+    if learned is None or original is None:
+        return ""
+    before: dict[str, list[Any]] = {}
+    now: dict[str, list[Any]] = {}
+    _collect(original.to_json(), "", before)
+    _collect(learned.to_json(), "", now)
     differing = [key for key in {**before, **now} if before.get(key) != now.get(key)]
-    for key in differing[:MOST_CHANGES]:
-        yield f"{key}={_values(now.get(key, []))} instead of {_values(before.get(key, []))}"
-    if len(differing) > MOST_CHANGES:
-        yield f"and {len(differing) - MOST_CHANGES} more settings"
+    changes = [f"{key}={_shown(now.get(key))} instead of {_shown(before.get(key))}" for key in differing]
+    if len(changes) > MOST_CHANGES:
+        changes[MOST_CHANGES:] = [f"and {len(changes) - MOST_CHANGES} more settings"]
+    return ", ".join(changes)
 
 
-def _settings(value: Any) -> dict[str, list[Any]]:
-    """Return the values of nested JSON by dotted names, in their order; the places in lists are left out."""
-    found: dict[str, list[Any]] = {}
-    for key, each in _leaves(value):
-        if key.partition(".")[0] not in NOT_COMPARED:
-            found.setdefault(key, []).append(each)
-    return found
-
-
-def _leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the plain values of nested JSON, lists of plain values among them, with their dotted names."""
+def _collect(value: Any, key: str, found: dict[str, list[Any]]) -> None:
+    """Add the values of nested JSON by dotted names, such as ``blocks.num_frames``; places in lists are left out."""
     if isinstance(value, Mapping):
         for name, inner in value.items():
-            yield from _leaves(inner, f"{key}.{name}".lstrip("."))
+            if key or name not in NOT_COMPARED:
+                _collect(inner, f"{key}.{name}".lstrip("."), found)
     elif isinstance(value, list) and any(isinstance(inner, (Mapping, list)) for inner in value):
         for inner in value:
-            yield from _leaves(inner, key)
+            _collect(inner, key, found)
     else:
-        yield key, value
+        found.setdefault(key, []).append(value)
 
 
-def _values(values: Iterable[Any]) -> str:
-    """Return different values in words, and nothing for none."""
-    known = list(dict.fromkeys(map(str, values)))
+def _shown(values: Iterable[Any] | None) -> str:
+    known = list(dict.fromkeys(map(str, values or ())))
     more = f" and {len(known) - MOST_VALUES} others" if len(known) > MOST_VALUES else ""
     return "/".join(known[:MOST_VALUES]) + more or "nothing"
 

@@ -61,21 +61,20 @@ def draw_trees(trees: Trees, seed: int) -> Any:
 
 def find_trees(run: Run) -> Trees:
     """Return the agent and the curriculum of a run as far as its directory has them."""
-    reason = f"{run.path} has no {AGENT}, the weights of its agent"
     try:
         curriculum = Curriculum.from_json(run.path / CURRICULUM)
-        if not are_graphs(curriculum.tasks):
-            kind = type(curriculum.tasks[0]).__name__
-            return Trees(None, None, f"they are of CT-graphs, and its tasks are of {kind}")
-        if (run.path / AGENT).exists():
-            trained = load(run.path)
-            return Trees(trained.curriculum, trained, "")
-    except Exception as error:  # files of others fail in any way; the report says why
-        reason = " ".join(str(error).split()).rstrip(". ") or type(error).__name__
-    try:
-        return Trees(Curriculum.from_json(run.path / CURRICULUM), None, reason)
     except (OSError, ValueError) as error:
         return Trees(None, None, str(error))
+    if not are_graphs(curriculum.tasks):
+        kind = type(curriculum.tasks[0]).__name__
+        return Trees(None, None, f"they are of CT-graphs, and its tasks are of {kind}")
+    if not (run.path / AGENT).exists():
+        return Trees(curriculum, None, f"{run.path} has no {AGENT}, the weights of its agent")
+    try:
+        trained = load(run.path)
+    except Exception as error:  # files of others fail in any way; the report says why
+        return Trees(curriculum, None, " ".join(str(error).split()).rstrip(". ") or type(error).__name__)
+    return Trees(trained.curriculum, trained, "")
 
 
 def _visits(trained: Trained, task: Any, seed: int) -> Visits:
