@@ -77,7 +77,7 @@ def write_report(paths: Sequence[Path | str], folder: Path) -> Path:
 
     Raises:
         ModuleNotFoundError: before any work, without what the extra ``report`` installs.
-        ValueError: if there is no collective, or one cannot be read.
+        ValueError: if no collective can be read.
         BlockingIOError: if another process writes into the folder.
     """
     require_packages()

@@ -1,8 +1,14 @@
 """A run's log as tidy tables: one row per evaluation of a task, one row per training interval.
 
 CSV always, Parquet with ``pip install 'ctgraph_rl[tables]'``. The first columns say which run a row is of, so that the
-tables of many runs can be put below each other. Undefined and unmeasured values are empty cells, or null.
-``pandas.read_csv("evaluations.csv")`` and ``pandas.read_parquet("evaluations.parquet")`` read them.
+tables of many runs can be put below each other. Undefined and unmeasured values are empty cells, or null. A
+reader in three lines::
+
+    import csv
+    with open("evaluations.csv", newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+
+and in one, ``pandas.read_csv("evaluations.csv")`` or ``pandas.read_parquet("evaluations.parquet")``.
 """
 
 from __future__ import annotations

@@ -25,16 +25,16 @@ COLUMNS = ("agent", "property", "score", "low", "high", "n", "reason", "measured
 
 
 def write_profile(paths: Sequence[Path | str], folder: Path | str, agents: Sequence[str] = ()) -> Profiles:
-    """Write ``profile.md`` with its figure, ``profile.csv`` and ``profile.tex``, and return the scores.
+    """Write ``profile.md`` with its figure, ``profile.csv`` and ``profile.tex``; return the scores of `profile_scores`.
 
     Args:
-        paths: see `profile_scores`.
+        paths: folders of runs.
         folder: where the page goes.
-        agents: see `profile_scores`.
+        agents: names and order of agents.
 
     Raises:
         ModuleNotFoundError: before any work, without what the extra ``report`` installs.
-        ValueError: see `profile_scores`.
+        ValueError: if there is no run of a profile curriculum.
         BlockingIOError: if another process writes into the folder.
     """
     require_packages()

@@ -158,17 +158,16 @@ class Results(NamedTuple):
 def profile_scores(paths: Sequence[Path | str], agents: Sequence[str] = ()) -> dict[str, dict[str, Score]]:
     """Return the scores of all agents whose runs of profile curricula are in or below some folders.
 
-    A property counts all seeds of an agent or none: it has a gap where a run is not finished, was evaluated at other
-    moments than its curriculum says, or lacks a control of the same seed. The reason names the run and the command that
-    gives what it lacks.
+    A property counts all seeds of an agent or none: it has a gap where a run is not finished, lacks a control of the
+    same seed, or was evaluated at other moments than its curriculum says. The reason names the run and a command.
 
     Args:
         paths: folders of runs, of ``ctgraph-rl profile`` or of a `ctgraph_rl.Recorder`.
         agents: names and order of agents, see `ctgraph_rl.report.names.displayed`.
 
     Returns:
-        For each agent its score by the title of each property; one without a run or a value says why. A modified
-        curriculum counts where the published one has no score, and the reason names it.
+        For each agent its score by the title of each property. A modified curriculum counts where the published one has
+        no score, and the reason names it.
 
     Raises:
         ValueError: if there is no run of a profile curriculum.

@@ -53,24 +53,22 @@ def results(paths: Path | str | Sequence[Path | str]) -> pandas.DataFrame:
     The columns are:
 
     - ``run``, ``agent``, ``method``, ``settings``, ``learner``, ``curriculum``, ``fingerprint``: category. ``settings``
-      is JSON. ``learner`` is the agent's name in the tables of ``ctgraph-rl results``, ``method`` is ``Finetune`` where
-      there is none.
+      is JSON. ``learner`` is the agent's name in ``ctgraph-rl results``; ``method`` is ``Finetune`` for none.
     - ``numbers_version``, ``seed``: int64.
-    - ``task``: category, the task's label; ``held_out``: boolean, whether no block trains it.
+    - ``task``: category, its label; ``held_out``: boolean, whether no block trains it.
     - ``block``: Int64, 0 before any training; ``moment``: category, ``before``, ``during`` or ``after`` the block.
     - ``frames``: Int64, learned so far; ``episode``: Int64, of a row that adapts, from 1.
     - ``metric``: category; ``value``: float64, NaN where a metric is undefined.
 
     Metrics of evaluations are ``return_mean`` and ``success_rate``. Those of training intervals begin with
     ``training_`` and have no task, those of rows that adapt begin with ``adaptation_``. All others are of the whole
-    run, see ``docs/reference/metrics.md``, and have neither task nor block. Missing values mean that a column says
-    nothing about a row.
+    run, see ``docs/reference/metrics.md``, and have neither task nor block.
 
     Args:
         paths: run directories, or folders that hold them. Single-task experts are left out where there are other runs.
 
     Warns:
-        UserWarning: for each run that is left out: one that is unfinished, broken, or there twice.
+        UserWarning: for each run that is left out: an unfinished or broken one, or a second copy.
 
     Raises:
         ModuleNotFoundError: without pandas; names the extra to install.

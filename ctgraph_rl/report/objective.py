@@ -16,10 +16,10 @@ def check_objective(name: str | None, experts: bool) -> None:
 
     Args:
         name: of a metric; None: there is no objective.
-        experts: does the run have experts?
+        experts: whether the run has experts.
 
     Raises:
-        ValueError: for an unknown name, with the one that was probably meant or all, and for one that needs experts.
+        ValueError: for an unknown name, and for one that needs experts.
     """
     if name is None:
         return

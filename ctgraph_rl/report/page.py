@@ -103,12 +103,12 @@ def write_report(
             the working directory.
         agents: names and order of agents, see `ctgraph_rl.report.names.displayed`.
         width: of figures: ``text`` of a page, or one of two columns, ``column``.
-        colours: of agents, each as ``NAME=COLOUR`` with its name in figures.
+        colours: of agents, each as ``NAME=COLOUR``.
         count: is called after each run that is read, each agent and each figure.
 
     Raises:
         ModuleNotFoundError: before any work, without what the extra ``report`` installs.
-        ValueError: if there is no run that can be read, and for a width, an agent or a colour that there is not.
+        ValueError: if no run can be read, and for an unknown width, agent or colour.
         BlockingIOError: if another process writes into the folder.
     """
     require_packages()

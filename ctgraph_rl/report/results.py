@@ -74,7 +74,7 @@ class Row:
         definition: id of the metric's definition.
         note: why seeds have no value.
         seed: of the run that it is of; None for all seeds.
-        columns: the metrics that tables show of its curriculum, see `ctgraph_rl.report.columns.columns`.
+        columns: metrics that tables show of its curriculum.
     """
 
     curriculum: str

@@ -185,7 +185,7 @@ def training_curve(
 
     Args:
         runs: of one agent.
-        block: the block, from 1.
+        block: from 1.
         start: frames before it.
         end: frames at its end.
         places: number of spans.

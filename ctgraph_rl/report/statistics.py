@@ -1,16 +1,14 @@
 """Statistics over seeds: what n runs of one agent say, and what they leave open.
 
-There is one rule for each kind of number, and ``docs/explanation/statistics.md`` has their coverage by simulation:
+There is one rule for each kind of number; ``docs/explanation/statistics.md`` has their coverage by simulation:
 
 - A share, and a mean of values with known bounds: Gaffke's interval. It assumes no distribution, stays within the
-  bounds, has a width where all seeds agree, and is that of Clopper and Pearson for two outcomes at the bounds.
+  bounds, and is that of Clopper and Pearson for two outcomes at the bounds.
 - A mean of values without two known bounds: Student's interval, cut at a bound that is known.
 - A time: the interval of the median by order statistics, where a seed that never got there took infinitely long.
 
-Beside these are the numbers that other papers show: `mean` without bounds has Student's interval, `mean_and_std` the
-standard deviation, and `iqm` the interquartile mean of rliable.
-
-A seed without a value is counted, never replaced. Quantiles are scipy's: ``pip install 'ctgraph_rl[stats]'``.
+Other papers show `mean` without bounds (Student's interval), `mean_and_std` and `iqm`, the interquartile mean of
+rliable. A seed without a value is counted, never replaced. Quantiles are scipy's: ``pip install 'ctgraph_rl[stats]'``.
 """
 
 from __future__ import annotations
@@ -111,14 +109,14 @@ class Comparison:
 
     Args:
         difference: mean of first minus second, with its interval; pairs without both values are undefined.
-        std: standard deviation of the differences, for `seeds_needed`; None below two pairs.
+        std: standard deviation of the differences; None below two pairs.
         p_value: of the test that flips signs of differences at random; exact up to `MOST_FLIPPED` pairs.
         wins: pairs in which the first is better.
         ties: pairs without a difference.
         losses: pairs in which the second is better.
-        holm: the p-value corrected for all comparisons that were made; None where that is not known.
-        needed: pairs with which a difference such as this one is found, see `pairs_needed`; None where it was found,
-            where there is none, and where the number of comparisons is not known.
+        holm: the p-value corrected for all comparisons; None where these are not known.
+        needed: pairs that would find such a difference, see `pairs_needed`; None where it was found, is 0, or where the
+            number of comparisons is not known.
     """
 
     difference: Estimate
@@ -388,7 +386,7 @@ def corrected(found: Mapping[Any, Comparison]) -> dict[Any, Comparison]:
 def pairs_needed(difference: float, std: float, comparisons: int = 1, level: float = LEVEL) -> int:
     """Return with how many pairs `compare` finds a difference with a chance of 80 %.
 
-    They are those of `seeds_needed`, and so many that the test can find anything: its smallest p-value is 2 / 2^n. Both
+    They are those of `seeds_needed`, and so many that the smallest p-value of the test, 2 / 2^n, is small enough. Both
     are corrected for the number of comparisons (Bonferroni).
 
     Args:

@@ -1,8 +1,7 @@
 """Run directories as data: each log is read once, and only what tables and figures need is kept of it.
 
 Runs of one configuration but for the seed belong together. Those in one folder that name no agent are one learner with
-the name of the folder.
-A directory that cannot be read is a `Problem` with its reason, and never a number.
+the name of the folder. A directory that cannot be read is a `Problem` with its reason, and never a number.
 """
 
 from __future__ import annotations
@@ -115,8 +114,8 @@ class Run:
         path: the directory.
         about: the first line of its log.
         agent: class or name of the learner, ``PPO + EWC`` with a method; None if the configuration does not say.
-        settings: the configuration without the seed and what the fingerprint covers, by dotted keys; the folder that
-            the directory is in with them if there is no agent.
+        settings: the configuration without the seed and what the fingerprint covers, by dotted keys; with the folder
+            of the directory if there is no agent.
         seed: the seed.
         reason: why it has no results; None for a finished run.
         metrics: `Metric` fields by name; empty without results.

@@ -1,8 +1,7 @@
 """Performance profiles and the probability of improvement, as rliable defines and draws them (Agarwal et al. 2021).
 
-Scores are the mean returns at the last evaluation of each task, as in the interquartile mean. Intervals are percentiles
-of a bootstrap that draws the seeds of each task independently of other tasks and agents. Intervals of few seeds cover
-less than they say.
+Scores are the mean returns at the last evaluation of each task. Intervals are percentiles of a bootstrap that draws the
+seeds of each task and agent apart; those of few seeds cover less than they say.
 """
 
 from __future__ import annotations

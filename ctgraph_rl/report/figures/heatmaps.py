@@ -101,11 +101,11 @@ def _draw(
 
     Args:
         axes: where they go.
-        matrix: rows of estimates; from block 1 on they are changes, and have a sign.
+        matrix: rows of estimates.
         colours: name of a colour map.
         scale: its lowest and highest value.
         labels: of the tasks.
-        first: number of the first row's block.
+        first: number of the first row's block; from 1 on the rows are changes, and have a sign.
     """
     axes.set_facecolor(NO_VALUE)
     values = _values(matrix)
