@@ -118,7 +118,7 @@ def _verdict(found: Sequence[Sequence[LogLine]], bound: float) -> tuple[int, str
     for pair in zip(*found, strict=False):
         if pair[0] != pair[1] and beyond is None:
             unequal = unequal or pair
-            beyond = None if _is_rounding(*pair, bound, scale) else pair
+            beyond = None if _is_rounding(pair[0], pair[1], bound, scale) else pair
     if unequal is None and lengths[0] == lengths[1]:
         return EQUAL, f"equal: all {lengths[0]} measurements, bit for bit"
     if unequal is None:
@@ -136,8 +136,9 @@ def _is_rounding(one: LogLine, other: LogLine, bound: float, scale: Mapping[str,
     for key in _differing(one, other):
         first = one.get(key)
         second = other.get(key)
-        are_floats = isinstance(first, float) and isinstance(second, float)
-        if not are_floats or abs(first - second) > bound * scale[key]:
+        if not (isinstance(first, float) and isinstance(second, float)):
+            return False
+        if abs(first - second) > bound * scale[key]:
             return False
     return True
 

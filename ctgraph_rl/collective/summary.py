@@ -85,8 +85,11 @@ class Collective:
     def final_return(self) -> float:
         """Sum of the final returns of all members, each the mean over its blocks; blocks without one count 0."""
         blocks = Counter(each.member for each in self.learned)
-        known = [each for each in self.learned if each.final_return is not None]
-        return math.fsum(each.final_return / blocks[each.member] for each in known)
+        values = []
+        for each in self.learned:
+            if each.final_return is not None:
+                values.append(each.final_return / blocks[each.member])
+        return math.fsum(values)
 
     def total(self, what: str) -> int:
         """Return the sum of a column of the messages."""

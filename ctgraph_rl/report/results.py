@@ -297,6 +297,7 @@ def _values(by_seed: BySeed, metric: str) -> list[float | None]:
 def _note(by_seed: BySeed, metric: str | None, estimate: Estimate) -> str:
     reasons: dict[str, list[str]] = {}
     for seed, run in by_seed.items():
+        reason: str | None
         if run is None:
             reason = "no run"
         elif run.reason is not None or metric is None:

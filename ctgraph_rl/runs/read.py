@@ -370,9 +370,10 @@ def _history(log: RunLog, values: Sequence[Value]) -> History:
     evaluations: dict[str, Curve] = {}
     training: dict[int, Curve] = {}
     for task, held_out, block, _, frames, _, metric, value in values:
-        if metric == "return_mean" and not held_out:
+        assert frames is not None
+        if metric == "return_mean" and task is not None and not held_out:
             evaluations.setdefault(task, []).append((frames, math.nan if value is None else value))
-        elif metric == "training_return_mean" and value is not None:
+        elif metric == "training_return_mean" and block is not None and value is not None:
             training.setdefault(block, []).append((frames, value))
     adapted = {"trained": log.adaptation(), "held-out": log.adaptation(held_out=True)}
     experts_together: list[bool] = []
