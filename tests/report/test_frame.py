@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 
@@ -10,7 +11,7 @@ from helpers.made_runs import all_runs, make_run
 from helpers.paths import CHECKOUT
 
 from ctgraph_rl import RunLog, results
-from ctgraph_rl.report.results import print_table
+from ctgraph_rl.report.results import print_table, table
 from ctgraph_rl.report.terminal import print_summary
 
 
@@ -81,6 +82,18 @@ def test_what_is_left_out_is_said_and_without_a_finished_run_there_is_no_frame(t
         frame = results(tmp_path)
 
     assert frame.seed.unique().tolist() == [0]
+
+
+def test_a_run_whose_log_is_broken_and_says_no_blocks_has_no_returns(tmp_path):
+    path = make_run(tmp_path, 0, finished=False)
+    about, *_ = RunLog.read(path / "run.jsonl").measurements
+    del about["trained"]
+    (path / "run.jsonl").write_text(json.dumps(about) + "\nno measurement\n{}\n")
+
+    [run] = all_runs([tmp_path])
+
+    assert (run.values, run.returns, run.success, run.tasks) == ((), {}, {}, [])
+    assert [row.measure for row in table([run])] == ["every_metric"]
 
 
 def test_tables_and_summaries_need_no_pandas_and_a_frame_says_what_to_install(tmp_path, monkeypatch, capsys):
