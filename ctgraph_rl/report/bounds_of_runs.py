@@ -93,8 +93,8 @@ def bounds_of(runs: Iterable[Run]) -> BoundsOfRuns:
 def bounds_of_curriculum(curriculum: Curriculum, evaluations: int = 1) -> BoundsOfRuns:
     """Return the bounds of what runs of a curriculum measure.
 
-    Each task says what an episode can return, which bounds means of episodes. What bounds only the mean over all seeds,
-    such as the optimum, does not count.
+    Each task says what an episode can return, which bounds means of episodes. Bounds of the mean over all seeds alone,
+    such as the optimum, do not count.
 
     Args:
         curriculum: what they learn.
