@@ -1,8 +1,7 @@
 """What a collective measured, from its directory: learning times of its members, messages, and who helped whom.
 
-``collective.jsonl`` is written while it learns: its first line names members and configuration, a line ``exchange`` has
-the counts of a kind of message in an exchange, a line ``help`` is what a member took over. All else is made of it and
-of the members' logs.
+The first line of ``collective.jsonl`` names members and configuration, a line ``exchange`` has the counts of a kind of
+message, a line ``help`` is what a member took over. All else is made of it and of the members' logs.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """A run in another program's format.
 
 l2metrics reads log format 1.1 of l2logger. A training interval, and an evaluation of a task, is one experience with its
-mean return as reward. Time stamps count experiences, so that equal runs give equal files; a runtime that is taken from
-them means nothing.
+mean return as reward. Time stamps count experiences, so that equal runs give equal files.
 """
 
 from __future__ import annotations

@@ -113,11 +113,8 @@ def write_evaluations(path: Path, runs: Sequence[tuple[str, str, RunLog]]) -> No
     """Write the evaluations of many runs as one table, in CSV or Parquet by the ending of its name.
 
     Args:
-        path: the file.
+        path: see `check_table`.
         runs: agent, directory and log of each; agent and directory are the first two columns.
-
-    Raises:
-        ValueError, ModuleNotFoundError: as `check_table`.
     """
     check_table(path)
     types = _types("evaluation", EVALUATIONS, *(log for _, _, log in runs))

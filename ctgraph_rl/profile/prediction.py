@@ -89,8 +89,8 @@ def known_bits(folder: Path, agent_class: Any, task: Task) -> KnownBits:
 def bits_of_model(model: Model, task: Task) -> KnownBits:
     """Return how much a model knows of a task's next observation and reward, and how much can be known.
 
-    The values of the best memoryless predictor and of the exact model are means over the same steps of the probability
-    that each gives to what came. So a model with their probabilities has exactly their values.
+    All values are means over the same steps of the probability given to what came, so a model with the probabilities of
+    the exact model has exactly its value.
 
     Args:
         model: an agent with ``predict_next``; see `ctgraph_rl.agent.Model`.

@@ -1,8 +1,7 @@
 """Tables for papers: LaTeX with booktabs that stays within the margins of ``article``, with caption and label.
 
-A cell is a value over its interval. Values of a column end in the same number of decimals and stand at its right side,
-so that their decimal points are below each other. Wide tables have several parts below each other, and long ones are
-several tables. A part that is still wider than a line, as for long names, is scaled down to it.
+A cell is a value over its interval, and decimal points of a column are below each other. Wide tables have several
+parts, and long ones are several tables. A part that is still wider than a line is scaled down to it.
 """
 
 from __future__ import annotations

@@ -103,7 +103,7 @@ def colours_of(runs: Sequence[Run], given: Sequence[str]) -> dict[str, str]:
     """Return the colours of agents that are given as ``NAME=COLOUR``, by their names in tables and figures.
 
     Raises:
-        ValueError: for an unknown agent, with the one that was probably meant, and for what has no colour.
+        ValueError: for an unknown agent, and for what has no colour.
     """
     known = _agents(runs)
     found = {}

@@ -106,7 +106,7 @@ def panels(count: int, most: int, height: float, width: float = 1, room: float =
         count: how many are needed.
         most: in a row of a page's text.
         height: of a row, in inches.
-        width: share of the width of a whole figure.
+        width: share of a whole figure's.
         room: beside the rows, in inches.
         shared: ``sharex`` and ``sharey``.
     """

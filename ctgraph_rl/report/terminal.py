@@ -117,7 +117,7 @@ def sparklines(evaluations: Mapping[str, Curve], bars: str = BARS, most: int = M
 def _tasks(name: str, history: History, curves: Mapping[str, str]) -> Table:
     """Return a line for each task: its return before training, the best one after a block, the last one, and its curve.
 
-    The block of a best that is not above 0 is left out: that is of no block.
+    A best that is not above 0 is of no block.
     """
     where = f"performance.csv has it after each of {len(history.ends) - 1} blocks"
     table = Table(title=_text(f"{name}: mean return on each task; {where}"))

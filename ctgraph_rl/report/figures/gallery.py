@@ -45,9 +45,9 @@ class Gallery:
 
     Args:
         folder: of the report.
-        width: of figures, see `style`.
-        colours: of agents, see `style`.
-        count: is called with how many figures are drawn or not there to be drawn.
+        width: see `style`.
+        colours: see `style`.
+        count: is called with how many figures are done.
     """
 
     def __init__(
