@@ -93,7 +93,7 @@ def bounds_of(runs: Iterable[Run]) -> BoundsOfRuns:
 def bounds_of_curriculum(curriculum: Curriculum, evaluations: int = 1) -> BoundsOfRuns:
     """Return the bounds of what runs of a curriculum measure.
 
-    Each task says what an episode can return, which bounds means of episodes. Bounds of the mean over all seeds alone,
+    Each task says what an episode can return, which bounds means of episodes. Bounds of the mean over all seeds,
     such as the optimum, do not count.
 
     Args:
