@@ -7,6 +7,7 @@ name that the user gives, such as ``--csv FILE``, is followed: `write_named`.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -197,6 +198,31 @@ def _is_regular_or_missing(path: Path) -> bool:
 
 def _opener(more: int) -> Callable[[str, int], int]:
     return lambda path, flags: os.open(path, flags | more, 0o666)
+
+
+@contextmanager
+def appending(path: Path, known: os.stat_result) -> Iterator[int]:
+    """Open a file again that this process made, to append to it.
+
+    Args:
+        path: the file.
+        known: what it was found to be; what is appended to another would be lost.
+
+    Raises:
+        FileNotFoundError: if it was moved, removed or replaced.
+    """
+    moved = f"{path} was moved, removed or replaced while this run was writing it; the run stops here"
+    error = FileNotFoundError(errno.ENOENT, f"{moved}. Move it back and run the same command, which resumes it")
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except FileNotFoundError:
+        raise error from None
+    try:
+        if not os.path.samestat(os.fstat(descriptor), known):
+            raise error
+        yield descriptor
+    finally:
+        os.close(descriptor)
 
 
 def append_line(path: Path, value: object) -> None:

@@ -47,6 +47,8 @@ ALLOWED = {
     ("ctgraph_rl.log.run_log", "file.truncate"): "as above",
     ("ctgraph_rl.report.page", "folder.mkdir"): "named by the user",
     ("ctgraph_rl.runs.checkpoints", "each.save"): "a method of Checkpoints, which writes through ctgraph_rl.disk",
+    ("ctgraph_rl.runs.on_dask", "Path(sys.argv[1]).write_bytes"): "in a folder of this process",
+    ("ctgraph_rl.runs.on_dask", "tempfile.TemporaryDirectory"): "as above",
     ("ctgraph_rl.runs.sweep", "folder.mkdir"): "named by the user",
     ("ctgraph_rl.runs.job", "folder.mkdir"): "as above",
     ("ctgraph_rl.runs.trackers", "folder.mkdir"): "after a link is refused",

@@ -6,13 +6,13 @@ import os
 import socket
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import BinaryIO
 from weakref import WeakSet
 
-from ctgraph_rl.disk import open_own
+from ctgraph_rl.disk import open_own, read_regular
 
 LOG, AGENT, METRICS, CURRICULUM = "run.jsonl", "agent.pt", "metrics.json", "curriculum.json"
 """Files of a run's directory; `METRICS` is there when the run is complete."""
@@ -39,6 +39,9 @@ EX_TEMPFAIL = 75
 SECONDS_BETWEEN_ATTEMPTS = 0.5
 """To get a lock that another writer has."""
 
+BY_WAY_OF = b"\nby way of "
+"""Stands in a lock file between who has the directory and the lock file that is locked for it."""
+
 ATTEMPTS_TO_READ = 10
 """Who has a lock, within half a second."""
 
@@ -55,17 +58,9 @@ def list_members(folder: Path) -> list[Path]:
 
 @contextmanager
 def locked(folder: Path, waiting: Callable[[], object] | None = None) -> Iterator[None]:
-    """Keep all other writers out of a directory, those of this process too; the lock ends with the process at last.
-
-    Args:
-        folder: an existing directory, on a file system with POSIX locks.
-        waiting: called every half second while another writer is there; None fails at once instead.
-
-    Raises:
-        BlockingIOError: if another writer is there; names its host, process and start.
-        OSError: if the file system has no locks.
-    """
-    with _locked(folder / LOCK, folder, waiting):
+    """Keep all other writers out of a directory; see `Locks.add`."""
+    with closing(Locks()) as locks:
+        locks.add(folder, waiting)
         yield
 
 
@@ -74,9 +69,10 @@ def locked_new(folder: Path) -> Iterator[None]:
     """Keep all other writers from making a folder, by a lock beside it, where the folder to come has a parent.
 
     Raises:
-        BlockingIOError, OSError: see `locked`.
+        BlockingIOError, OSError: see `Locks.add`.
     """
-    with _locked(folder.parent / f".{folder.name}{LOCK}", folder, None):
+    with closing(Locks()) as locks:
+        locks.add(folder, None, folder.parent / f".{folder.name}{LOCK}")
         yield
 
 
@@ -94,49 +90,115 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_close_copies)
 
 
-@contextmanager
-def _locked(path: Path, folder: Path, waiting: Callable[[], object] | None) -> Iterator[None]:
-    file = _lock(path, folder, waiting)
-    _held.add(file)
-    try:
-        yield
-    finally:
+class Locks:
+    """Keeps all other writers out of directories, those of this process too; all locks end with the process at last.
+
+    The first lock file is open and locked. Those of more directories name it, so that one is open for any number.
+    """
+
+    def __init__(self) -> None:
+        self._file: BinaryIO | None = None
+        self._path = Path()
+        self._others: dict[Path, bytes] = {}
+
+    def add(self, folder: Path, waiting: Callable[[], object] | None = None, path: Path | None = None) -> None:
+        """Lock a directory.
+
+        Args:
+            folder: an existing directory, on a file system with POSIX locks.
+            waiting: called every half second while another writer is there; None fails at once instead.
+            path: the lock file; default: `LOCK` in the directory.
+
+        Raises:
+            BlockingIOError: if another writer is there; names its host, process and start.
+            OSError: if the file system has no locks.
+        """
+        path = (folder / LOCK if path is None else path).absolute()
+        file = _lock(path, folder, waiting)
+        if self._file is None:
+            self._file = file
+            self._path = path
+            _held.add(file)
+            with suppress(OSError):  # on a full disk without, for only messages and more directories need it
+                _sign(file, f"{_signature()}since {datetime.now(UTC).isoformat(timespec='microseconds')}".encode())
+            return
+        with file:
+            name = os.path.relpath(self._path, path.parent).encode("utf-8", "surrogateescape")
+            content = _read(self._file) + BY_WAY_OF + name
+            _sign(file, content)
+            self._others[path] = content
+
+    def close(self) -> None:
+        """Let others in."""
+        if self._file is None:
+            return
         try:
-            if not file.closed and _is_still_there(file, path):  # not a fork's, nor that of another folder
-                path.unlink(missing_ok=True)
+            if not self._file.closed:  # as a fork's is
+                for path, content in self._others.items():
+                    if _has(path, content):
+                        path.unlink(missing_ok=True)
+                if _is_still_there(self._file, self._path):
+                    self._path.unlink(missing_ok=True)
         finally:
-            file.close()
+            self._file.close()
+            self._file = None
 
 
 def _lock(path: Path, folder: Path, waiting: Callable[[], object] | None) -> BinaryIO:
-    """The open and locked file."""
+    """Return the open and locked file, which names no other lock that is held."""
     while True:
         file = open_own(path, "ab+")
         try:
             if _is_locked(file):
-                if _is_still_there(file, path):
-                    return _signed(file)
-            elif waiting is None:
-                raise BlockingIOError(f"{folder} is in use by {_holder(file)}")
+                is_there = _is_still_there(file, path)
+                if is_there and not _is_held_elsewhere(file, path):
+                    return file
             else:
-                waiting()
-                time.sleep(SECONDS_BETWEEN_ATTEMPTS)
+                is_there = True
+            if is_there and waiting is None:
+                raise BlockingIOError(f"{folder} is in use by {_holder(file)}")
         except BaseException:
             file.close()
             raise
         file.close()
+        if is_there and waiting is not None:
+            waiting()
+            time.sleep(SECONDS_BETWEEN_ATTEMPTS)
+
+
+def _is_held_elsewhere(file: BinaryIO, path: Path) -> bool:
+    """Return whether a lock file names one that is held by whom it says."""
+    signature, found, name = _read(file).partition(BY_WAY_OF)
+    if not found:
+        return False
+    try:
+        with open_own(path.parent / os.fsdecode(name), "rb+") as other:
+            return _read(other) == signature and not _is_locked(other)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+
+
+def _has(path: Path, content: bytes) -> bool:
+    try:
+        return read_regular(path, MOST_BYTES_OF_A_REASON) == content
+    except (OSError, ValueError):
+        return False
+
+
+def _read(file: BinaryIO) -> bytes:
+    file.seek(0)
+    return file.read()
 
 
 def _holder(file: BinaryIO) -> str:
     """Who has signed a lock file, and what to do about it."""
     signature = b""
     for _ in range(ATTEMPTS_TO_READ):  # it is signed right after it is locked
-        file.seek(0)
-        signature = file.read()
+        signature = _read(file)
         if signature:
             break
         time.sleep(SECONDS_BETWEEN_ATTEMPTS / ATTEMPTS_TO_READ)
-    holder = signature.decode(errors="replace") or "another process"
+    holder = signature.partition(BY_WAY_OF)[0].decode(errors="replace") or "another process"
     fix = f"{holder}; wait for it, or stop it"
     return f"{fix}: it is this process, close its Recorder or del it" if holder.startswith(_signature()) else fix
 
@@ -169,13 +231,10 @@ def _is_still_there(file: BinaryIO, path: Path) -> bool:
         return False
 
 
-def _signed(file: BinaryIO) -> BinaryIO:
-    """The file, in which we say who we are; on a full disk without, for only messages need it."""
-    now = datetime.now(UTC).isoformat(timespec="seconds")
+def _sign(file: BinaryIO, content: bytes) -> None:
+    """Write who we are into a file that is locked."""
     file.truncate(0)
-    with suppress(OSError):
-        file.write(f"{_signature()}since {now}".encode())
-    return file
+    file.write(content)
 
 
 OF_A_SWEEP = ("multirun.yaml", "optimization_results.yaml")

@@ -25,7 +25,6 @@ the only field that differs between two equal runs. A reader in three lines, for
 
 from __future__ import annotations
 
-import errno
 import json
 import math
 import os
@@ -39,7 +38,7 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, as_path, require
-from ctgraph_rl.disk import cannot_write, open_own, read_regular, write_whole
+from ctgraph_rl.disk import appending, cannot_write, open_own, read_regular, write_whole
 from ctgraph_rl.log.escape import csv_text
 from ctgraph_rl.log.measurement import check, parsed
 from ctgraph_rl.metrics import Column, Curves, Regime, RegimeTable, Trained
@@ -88,11 +87,16 @@ class RunLog:
         self._num_bytes = MOST_BYTES  # of the file that was read
         self.listeners: list[Callable[[NamedValues], object]] = []
         self._start = time.perf_counter()
-        self._path = None if path is None else as_path("path", path)
-        self._place = None if self._path is None else self._path.absolute()  # a program may change its directory
-        self._file: BinaryIO | None = None
-        if self._path is not None:
-            self._file = open_own(self._path, "xb")
+        self._path: Path | None = None
+        self._is_closed = False
+        if path is not None:
+            with open_own(as_path("path", path), "xb") as file:
+                self._write_to(file)
+
+    def _write_to(self, file: BinaryIO) -> None:
+        """Append to a file from now on. It is opened for each line: thousands of logs can be written at once."""
+        self._path = Path(os.fsdecode(file.name)).absolute()  # a program may change its directory
+        self._found = os.fstat(file.fileno())
 
     def __repr__(self) -> str:
         """Return the curriculum, the seed and how much was measured, in one line."""
@@ -119,12 +123,10 @@ class RunLog:
         require((there >= size, f"{path} has {there} bytes and the checkpoint needs {size}: restore the file"))
         with open_own(path, "r+b") as file:
             file.truncate(size)
-        log = cls.read(path)
+            log = cls.read(path)
+            log._write_to(file)
         require((log.torn_lines == 0, f"{path}: the last line before the checkpoint is torn: restore the file"))
-        log._path = path
-        log._file = open_own(path, "ab")
         log._num_bytes = MOST_BYTES
-        log._place = path.absolute()
         log._start -= position["seconds"]
         return log
 
@@ -134,31 +136,15 @@ class RunLog:
 
     def sync(self) -> int:
         """Let the lines so far reach the disk; return the length of the file, in bytes."""
-        if self._file is None or self._path is None or self._file.closed:
+        if self._path is None or self._is_closed:
             return 0
-        self._check_place()
-        size = self._file.tell()
-        try:
-            os.fsync(self._file.fileno())
-        except OSError as error:
-            raise cannot_write(self._path, size, error) from error
+        with appending(self._path, self._found) as descriptor:
+            size = os.fstat(descriptor).st_size
+            try:
+                os.fsync(descriptor)
+            except OSError as error:
+                raise cannot_write(self._path, size, error) from error
         return size
-
-    def _check_place(self) -> None:
-        """Refuse to write on where the file is not at its place any more, as what is written beside it would be lost.
-
-        Raises:
-            FileNotFoundError: if the run's directory was moved or removed.
-        """
-        assert self._file is not None and self._place is not None
-        own = os.fstat(self._file.fileno())
-        try:
-            is_there = os.path.samestat(own, self._place.stat())
-        except FileNotFoundError:
-            is_there = False
-        if not is_there:
-            message = f"{self._place} was moved, removed or replaced while this run was writing it; the run stops here"
-            raise FileNotFoundError(errno.ENOENT, f"{message}. Move it back and run the same command, which resumes it")
 
     def append(self, kind: str, **values: Any) -> None:
         """Add one measurement; NaN and infinity become null, as JSON has neither.
@@ -169,28 +155,25 @@ class RunLog:
         finite = {name: _finite(value) for name, value in values.items()}
         measurement = {"kind": kind, **finite, "seconds": round(time.perf_counter() - self._start, 3)}
         self.measurements.append(measurement)
-        if self._file is not None and self._path is not None:
-            self._check_place()
-            self._write(self._file, self._path, json.dumps(measurement).encode() + b"\n")
+        if self._path is not None:
+            require((not self._is_closed, f"{self._path} is closed: nothing can be added"))
+            line = json.dumps(measurement).encode() + b"\n"
+            with appending(self._path, self._found) as descriptor:
+                try:
+                    written = os.write(descriptor, line)
+                    while written < len(line):  # a full disk takes a part, and fails at the next attempt
+                        written += os.write(descriptor, line[written:])
+                except OSError as error:
+                    raise cannot_write(self._path, len(line), error) from error
         for listener in self.listeners:
             listener(measurement)
 
-    @staticmethod
-    def _write(file: BinaryIO, path: Path, line: bytes) -> None:
-        try:
-            written = file.write(line)
-            while written < len(line):  # a full disk takes a part, and fails at the next attempt
-                written += file.write(line[written:])
-        except OSError as error:
-            raise cannot_write(path, len(line), error) from error
-
     def close(self) -> None:
-        """Let all lines reach the disk, and close the file."""
-        if self._file is not None:
-            try:
-                self.sync()
-            finally:
-                self._file.close()
+        """Let all lines reach the disk, and end the log."""
+        try:
+            self.sync()
+        finally:
+            self._is_closed = True
 
     @classmethod
     def read(cls, path: Path | str) -> RunLog:

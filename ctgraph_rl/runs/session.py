@@ -28,7 +28,7 @@ from ctgraph_rl.learn.progress import ProgressBar
 from ctgraph_rl.learn.refusals import check_ids, check_rows
 from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.escape import terminal_text
-from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, FAILURE, LOG, METRICS, locked
+from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, FAILURE, LOG, METRICS, Locks
 from ctgraph_rl.log.provenance import NUMBERS_TOGETHER, code_changes, machine, provenance
 from ctgraph_rl.log.run_log import RunLog, metrics_text, write_metrics, write_performance
 from ctgraph_rl.log.scores import scores
@@ -179,6 +179,7 @@ class Session:
     def __init__(self, console: Console | None = None) -> None:
         self.console = console
         self._stack = ExitStack()
+        self._locks = self._stack.enter_context(closing(Locks()))
 
     def __enter__(self) -> Session:
         return self
@@ -190,11 +191,12 @@ class Session:
         """Return a session that now has what this one would close at its end."""
         other = Session(self.console)
         other._stack = self._stack.pop_all()
+        other._locks = self._locks
         return other
 
     def lock(self, run_dir: Path, waiting: Callable[[], object] | None = None) -> None:
-        """Keep all other writers out of a directory until the end; see `locked`."""
-        self._stack.enter_context(locked(run_dir, waiting))
+        """Keep all other writers out of a directory until the end; see `Locks.add`."""
+        self._locks.add(run_dir, waiting)
 
     def enter(self, part: AbstractContextManager[Opened]) -> Opened:
         """Open what is closed at the end, such as a tracker."""

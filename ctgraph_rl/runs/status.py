@@ -113,7 +113,7 @@ def failure(folder: Path) -> str:
 def lock_holder(folder: Path) -> str | None:
     """Return which process has locked a run directory; None for none, or one of this machine that has ended."""
     try:
-        holder = read_text(folder / LOCK, MOST_BYTES_OF_A_REASON)
+        holder = read_text(folder / LOCK, MOST_BYTES_OF_A_REASON).partition("\n")[0]
     except (OSError, ValueError):
         return None
     _, number, _, host, *_ = [*holder.split(), *[""] * 4]

@@ -182,7 +182,7 @@ def differences(one: Path, other: Path) -> list[str]:
 
 def unlike(whole: Path, other: Path) -> list[str]:
     """All in which the runs of two folders differ."""
-    pairs = [(path.parent, other / path.parent.relative_to(whole)) for path in sorted(whole.rglob("metrics.json"))]
+    pairs = [(path.parent, other / path.parent.relative_to(whole)) for path in sorted(whole.rglob("run.jsonl"))]
     found = [f"{run} has no metrics.json" for _, run in pairs if not (run / "metrics.json").exists()]
     for one, run in () if found else pairs:
         found += [f"{name} is damaged" for name in damaged(run)]

@@ -10,15 +10,16 @@ import signal
 import subprocess
 import sys
 import threading
+from contextlib import closing
 from unittest.mock import Mock
 
 import pytest
 from helpers.stopped_runs import StopsAfter, learn_into
 
-from ctgraph_rl import disk
+from ctgraph_rl import RunLog, disk
 from ctgraph_rl.disk import write_whole
 from ctgraph_rl.log import files
-from ctgraph_rl.log.files import LOCK, LOG, METRICS, locked
+from ctgraph_rl.log.files import LOCK, LOG, METRICS, Locks, locked
 from ctgraph_rl.log.sums import SUMS, stored_sums
 from ctgraph_rl.runs.status import status_of
 
@@ -111,6 +112,46 @@ def test_the_lock_of_a_killed_process_is_free(tmp_path, holder):
         assert f"process {os.getpid()} on" in (tmp_path / LOCK).read_text()
 
     assert list(tmp_path.iterdir()) == []
+
+
+def test_one_open_file_locks_any_number_of_directories_and_logs_hold_none(tmp_path):
+    folders = [tmp_path / str(number) for number in range(40)]
+    before = len(os.listdir("/proc/self/fd"))
+
+    with closing(Locks()) as locks:
+        for folder in folders:
+            folder.mkdir()
+            locks.add(folder)
+        logs = [RunLog(folder / LOG) for folder in folders]
+        for log in logs:
+            log.append("run")
+
+        assert len(os.listdir("/proc/self/fd")) == before + 1
+        for folder in folders:
+            with pytest.raises(BlockingIOError, match=f"{folder.name} is in use by process {os.getpid()} on"):
+                Locks().add(folder)
+            assert status_of(folder).state == "in use"
+
+    assert [path.name for folder in folders for path in folder.iterdir()] == [LOG] * 40
+
+
+def test_a_lock_that_names_one_of_a_killed_process_is_free_also_where_another_has_that(tmp_path):
+    folders = [tmp_path / "first", tmp_path / "second"]
+    with closing(Locks()) as locks:
+        for folder in folders:
+            folder.mkdir()
+            locks.add(folder)
+        left = [(folder / LOCK).read_bytes() for folder in folders]
+
+    for folder, content in zip(folders, left, strict=True):
+        (folder / LOCK).write_bytes(content)
+    with locked(folders[1]):
+        pass
+    (folders[1] / LOCK).write_bytes(left[1])
+    with locked(folders[0]), locked(folders[1]):
+        pass
+
+    assert not any((folder / LOCK).exists() for folder in folders)
 
 
 def test_who_waits_is_called_meanwhile_and_gets_the_lock(tmp_path, holder, monkeypatch):

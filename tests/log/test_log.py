@@ -55,7 +55,7 @@ def test_a_closed_log_is_written_to_no_more_and_one_in_memory_may_be_closed(tmp_
     log.close()
     in_memory.close()
 
-    with pytest.raises(ValueError, match="closed file"):
+    with pytest.raises(ValueError, match="is closed: nothing can be added"):
         log.append("training", block=1)
     in_memory.append("training", block=1)
 

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -464,3 +467,14 @@ def test_seeds_that_have_failed_are_an_error_of_the_group(tmp_path, monkeypatch)
 
     with pytest.raises(RuntimeError, match=r"^FloatingPointError: the loss is NaN; OSError: no disk$"):
         run_as_one([(config.composed([]), tmp_path)])
+
+
+@pytest.mark.slow
+def test_a_group_of_any_size_holds_as_many_files_open(tmp_path, checkout):
+    settings = " ".join(["-m", "'seed=range(90)'", "together=true", *PPO])
+    command = f"ulimit -n 150; exec {sys.executable} -m ctgraph_rl.run {settings}"
+
+    done = subprocess.run(["bash", "-c", command], env={**os.environ, "PYTHONPATH": str(checkout)}, cwd=tmp_path)
+
+    assert done.returncode == 0
+    assert len(runs()) == len(list(Path("runs").rglob("metrics.json"))) == 90

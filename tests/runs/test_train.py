@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import shutil
 import warnings
 from dataclasses import replace
@@ -163,28 +164,16 @@ def test_a_log_that_is_shorter_than_at_the_checkpoint_is_refused(stopped):
 
 
 def test_a_full_disk_stops_the_log_with_the_sizes_and_the_run_goes_on_from_its_checkpoint(stopped, whole, monkeypatch):
-    class Full:
-        def __init__(self, file):
-            self.file = file
+    write = os.write
 
-        def write(self, line):
-            if b'"frames": 128' in line:
-                self.file.write(line[:9])
-                raise OSError(errno.ENOSPC, "No space left on device")
-            return self.file.write(line)
-
-        def __getattr__(self, name):
-            return getattr(self.file, name)
-
-    resume = RunLog.resume
-
-    def on_a_full_disk(path, position):
-        log = resume(path, position)
-        log._file = Full(log._file)
-        return log
+    def on_a_full_disk(descriptor, line):
+        if b'"frames": 128' in line:
+            write(descriptor, line[:9])
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(descriptor, line)
 
     with monkeypatch.context() as patch:
-        patch.setattr(RunLog, "resume", on_a_full_disk)
+        patch.setattr(os, "write", on_a_full_disk)
         with pytest.raises(
             OSError, match=r"No space left on device: cannot write 0\.0 MB to .*run\.jsonl, .* are free"
         ):

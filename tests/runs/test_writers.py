@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,7 @@ from helpers.stopped_runs import learn_into
 from ctgraph_rl import Block
 from ctgraph_rl.collective import report as page_on_collectives
 from ctgraph_rl.collective.job import run_collective
-from ctgraph_rl.log.files import LOCK, locked
+from ctgraph_rl.log.files import LOCK, Locks
 from ctgraph_rl.profile import profile_page
 from ctgraph_rl.report.page import write_report
 from ctgraph_rl.runs.job import run_as_one, run_job
@@ -47,17 +48,21 @@ WRITERS: dict[str, Callable[..., object]] = {
 def test_every_writer_is_refused_where_another_is_and_changes_nothing(tmp_path, monkeypatch, compose, writer):
     folder = tmp_path / "run"
     folder.mkdir()
+    (tmp_path / "other").mkdir()
     monkeypatch.setattr(profile_page, "profile_scores", lambda *_: {"PPO": {}})
     monkeypatch.setattr(page_on_collectives, "find_collectives", lambda _: [])
     said = rf"run is in use by process {os.getpid()} on {socket.gethostname()} since 2.*: it is this process"
 
-    with locked(folder):
-        before = (folder / LOCK).read_text()
-        with pytest.raises(BlockingIOError, match=said):
-            WRITERS[writer](folder, compose)
+    for others in ([], [tmp_path / "other"]):
+        with closing(Locks()) as locks:
+            for each in (*others, folder):
+                locks.add(each)
+            before = (folder / LOCK).read_text()
+            with pytest.raises(BlockingIOError, match=said):
+                WRITERS[writer](folder, compose)
 
-        assert [path.name for path in folder.iterdir()] == [LOCK]
-        assert (folder / LOCK).read_text() == before
+            assert [path.name for path in folder.iterdir()] == [LOCK]
+            assert (folder / LOCK).read_text() == before
 
 
 def stop(folder: Path, **how: bool) -> None:
