@@ -101,9 +101,13 @@ def flat(settings: ReadOnlyValues, prefix: str = "") -> Iterator[tuple[str, Any]
             yield f"{prefix}{key}", value
 
 
+GONE: NamedValues = {"agent.deduplicate": False}
+"""Settings that are gone, with the value that changed nothing: sums of logs and digests of stored runs leave them out."""
+
+
 def as_before(settings: ReadOnlyValues) -> NamedValues:
     """Return the settings of a run without those of `ADDED` that have the value for "as before"."""
-    kept = _without(settings, ADDED.get("run", {}))
+    kept = _without(settings, {**ADDED.get("run", {}), **GONE})
     for key, value in kept.items():
         if isinstance(value, Mapping):
             kept[key] = _without(value, _added_to(value))

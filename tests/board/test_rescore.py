@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from helpers.paths import CHECKOUT
 from helpers.submissions import edit, edit_run
 
 from ctgraph_rl import RunLog
@@ -150,3 +151,12 @@ def test_numbers_of_the_first_line_of_a_log_count_and_three_differing_values_are
 
     assert rerun.why_other_bits(submission, [run])[0] == "device cuda"
     assert rerun.first_difference(log, other) == "first in line 2, training: a 1 and 2, b 1 and 2, c 1 and 2"
+
+
+def test_logs_of_a_setting_that_is_gone_keep_their_sum():
+    """Two stored lines: with `deduplicate`, which agents had, and without."""
+    for name in ("adaptation-rl2-depth2", "ppo"):
+        stored = read_submission(CHECKOUT / "docs" / "results" / "board" / name)
+        run = stored.runs[0]
+
+        assert log_sum(stored.log(run)) == run.log_sha256
