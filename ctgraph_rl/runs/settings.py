@@ -102,7 +102,7 @@ def flat(settings: ReadOnlyValues, prefix: str = "") -> Iterator[tuple[str, Any]
 
 
 GONE: NamedValues = {"agent.deduplicate": False}
-"""Settings that are gone, with the value that changed nothing: sums of logs and digests of stored runs leave them out."""
+"""Settings that are gone, with the value that changed nothing: sums of logs and digests of runs leave them out."""
 
 
 def as_before(settings: ReadOnlyValues) -> NamedValues:
