@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Iterable
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -64,8 +64,12 @@ class Stepped(NamedTuple):
     episode_reward: Tensor  # float32 [N]
 
 
+Observed = tuple[Tensor, Tensor | None]
+"""What rows observe, uint8 [N, *shape], and which are done, bool [N]; None where none is."""
+
+
 class Native:
-    """Takes the steps of one batch by the kernel; every method returns the next states and what `Rows` shows of them.
+    """Takes the steps of one batch by the kernel; a method returns the next states and what rows show.
 
     Bind parameters before the first step.
     """
@@ -85,28 +89,35 @@ class Native:
         """Copies start without what is prepared."""
         return {"params": self.params, "tables": self.tables, "_call": None, "_state": None, "_shapes": None}
 
-    def reset(self, state: RowState, mask: Tensor) -> StateAndShown:
-        """See `Rows.reset`."""
-        return self._show(state, mask=mask)
+    def take(
+        self, state: RowState, action: Tensor | None, mask: Tensor | None, shown: Tensor | None = None
+    ) -> StateAndShown:
+        """Start an episode in the rows of a mask, and step the others with their actions; see `Rows`.
 
-    def step(self, state: RowState, action: Tensor) -> StateAndShown:
-        """See `Rows.step`."""
-        return self._show(state, action=action)
+        Args:
+            state: where the rows are.
+            action: int64 [N]; None: no row steps.
+            mask: bool [N]; None: no row starts an episode.
+            shown: uint8 [N, *shape], what the rows showed last, where that is at hand and no row steps.
+        """
+        n = len(self.tables.entry)
+        device = self.params.row.device
+        made = Shown(
+            torch.empty(n, *self.params.bank.shape[1:], dtype=torch.uint8, device=device),
+            torch.empty(n, dtype=torch.uint8, device=device),
+            torch.empty(n, dtype=torch.int64, device=device),
+            torch.empty(n, dtype=torch.bool, device=device),
+        )
+        return self.run(state, made=made, action=action, mask=mask, shown=shown), made
 
-    def act(self, state: RowState, action: Tensor) -> tuple[RowState, tuple[Tensor, Tensor]]:
-        """See `Rows.act`."""
-        state, shown = self._show(state, action=action)
-        return state, (shown.observation, shown.done)
-
-    def step_or_reset(self, state: RowState, action: Tensor, mask: Tensor) -> StateAndShown:
-        """See `Rows.step_or_reset`."""
-        return self._show(state, action=action, mask=mask)
-
-    def restart(self, state: RowState, mask: Tensor | None, shown: Tensor | None) -> tuple[RowState, Tensor]:
-        """See `Rows.restart`."""
-        mask = torch.ones_like(state.node, dtype=torch.bool) if mask is None else mask
-        state, result = self._show(state, mask=mask, shown=shown)
-        return state, result.observation
+    def observe(
+        self, state: RowState, action: Tensor | None, mask: Tensor | None, shown: Tensor | None = None
+    ) -> tuple[RowState, Observed]:
+        """`take` for what is observed alone: every finished row is in the mask; without actions, None is all rows."""
+        if action is None and mask is None:
+            mask = torch.ones_like(state.node, dtype=torch.bool)
+        state, made = self.take(state, action, mask, shown)
+        return state, (made.observation, made.done)
 
     def step_and_restart(
         self, state: RowState, action: Tensor | None, most_action: int
@@ -141,49 +152,43 @@ class Native:
             shapes.append(one.expand(len(self.tables.entry), *pixels))
         return Stepped(*shapes)
 
-    def _show(self, state: RowState, **arrays: Any) -> StateAndShown:
-        """One call for all that rows show, with the arrays ``action``, ``mask`` and ``shown``."""
-        n = len(self.tables.entry)
-        device = self.params.row.device
-        made = Shown(
-            torch.empty(n, *self.params.bank.shape[1:], dtype=torch.uint8, device=device),
-            torch.empty(n, dtype=torch.uint8, device=device),
-            torch.empty(n, dtype=torch.int64, device=device),
-            torch.empty(n, dtype=torch.bool, device=device),
-        )
-        return self.run(state, **arrays, **made._asdict()), made
-
-    def run(self, state: RowState, num_steps: int = 1, restarts: bool = False, **arrays: Any) -> RowState:
+    def run(
+        self,
+        state: RowState,
+        num_steps: int = 1,
+        restarts: bool = False,
+        made: Shown | None = None,
+        **arrays: Tensor | None,
+    ) -> RowState:
         """Call the kernel; return the states that it leads to.
 
         Args:
             state: where to start.
             num_steps: T.
             restarts: rows that a step finishes start an episode within it.
-            arrays: those of ``_ARRAYS``, filled or read.
+            made: new arrays to fill, which are not checked.
+            arrays: those of ``_ARRAYS``, filled or read; of ``made``, only those that are read.
 
         Raises:
             ValueError: for arrays of a wrong shape or dtype, and for states that the rows' tasks cannot have.
         """
-        after, wrong = self._run(state, num_steps, restarts, **arrays)
+        after, wrong = self._run(state, num_steps, restarts, made=made, **arrays)
         require((wrong == 0, "the rows' states are none of their tasks: they have images outside the bank"))
         return after
 
-    def _run(self, state: RowState, *how: Any, **arrays: Any) -> tuple[RowState, int]:
-        """Call the kernel, see `run`; return the states, and how often it met something wrong."""
-        if torch.compiler.is_compiling():  # which cannot look into the call; disabling it takes 50 µs
-            return torch.compiler.disable(self._call_kernel)(state, *how, **arrays)
-        return self._call_kernel(state, *how, **arrays)
-
-    def _call_kernel(
+    def _run(
         self,
         state: RowState,
         num_steps: int = 1,
         restarts: bool = False,
         most_action: int = -1,
-        made: Stepped | None = None,
+        made: Shown | Stepped | None = None,
         **arrays: Tensor | None,
     ) -> tuple[RowState, int]:
+        """Call the kernel, see `run`; return the states, and how often it met something wrong."""
+        if torch.compiler.is_compiling():  # which cannot look into the call; disabling it takes 50 µs
+            run = torch.compiler.disable(self._run)
+            return run(state, num_steps, restarts, most_action, made, **arrays)
         if self._call is None or self._pointers != _pointers(self._alive):
             self._call = self._prepare()  # the first call, or tables that were moved, as into memory of many processes
         call = self._call
@@ -201,8 +206,9 @@ class Native:
         for name in names:
             kept.append(_set(call, name, arrays.get(name), 1 if name in _OF_ROWS else num_steps))
         if made is not None:  # for this call: nothing to check
-            for name, array in made._asdict().items():
-                setattr(call, name, array.data_ptr())
+            for name in _WRITTEN:
+                array = getattr(made, name, None)
+                setattr(call, name, None if array is None else array.data_ptr())
         wrong = library().ctgraph_run(ctypes.byref(call))
         del kept
         if not wrong:
@@ -328,6 +334,7 @@ _ARRAYS = {
 }
 """Arrays of a call, [T, N, ...]: the dtype, whether it holds images, whether it is read."""
 _READ = [name for name, (*_, is_read) in _ARRAYS.items() if is_read]
+_WRITTEN = [name for name in _ARRAYS if name not in _READ]
 _OF_ROWS = ("mask", "shown")
 """Those of [N, ...]."""
 _StatePointers = ctypes.c_void_p * len(RowState._fields)

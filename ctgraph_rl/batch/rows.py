@@ -296,7 +296,7 @@ class Rows(TakesNumbers, nn.Module):
         """Start an episode in the rows of a mask, bool [N], or in all; what all rows show."""
         mask = torch.ones_like(self.row, dtype=torch.bool) if mask is None else mask
         self._start_episodes(mask)
-        return self._keep(*self.engine.reset(self.state, mask))
+        return self._keep(*self.engine.take(self.state, None, mask))
 
     def step(self, action: Tensor, mask: Tensor | None = None) -> Shown:
         """One step of all rows, or of those of a mask, bool [N], with actions, int64 [N]; what all rows show.
@@ -305,10 +305,10 @@ class Rows(TakesNumbers, nn.Module):
         """
         before = self.state
         engine = self.engine
-        state, shown = engine.step(before, action if mask is None else action * mask)
+        state, shown = engine.take(before, action if mask is None else action * mask, None)
         if mask is not None:
             state = dynamics.choose(mask, state, before)
-            shown = dynamics.choose(mask, shown, engine.reset(before, torch.zeros_like(mask))[1])
+            shown = dynamics.choose(mask, shown, engine.take(before, None, torch.zeros_like(mask))[1])
         return self._keep(state, shown)
 
     def act(self, action: Tensor) -> tuple[Tensor, Tensor]:
@@ -316,12 +316,14 @@ class Rows(TakesNumbers, nn.Module):
 
         `result` tells more.
         """
-        return self._keep(*self.engine.act(self.state, action))
+        observation, done = self._keep(*self.engine.observe(self.state, action, None))
+        assert done is not None
+        return observation, done
 
     def step_or_reset(self, action: Tensor, mask: Tensor) -> Shown:
         """Start an episode in the rows of a mask, whatever their action, and step the others; what all rows show."""
         self._start_episodes(mask)
-        return self._keep(*self.engine.step_or_reset(self.state, action, mask))
+        return self._keep(*self.engine.take(self.state, action, mask))
 
     def result(self, done: Tensor) -> tuple[Tensor, Tensor]:
         """Outcome, uint8 [N], and leaf, int64 [N], of the rows that are done; see `CTGraphEnv`."""
@@ -333,7 +335,7 @@ class Rows(TakesNumbers, nn.Module):
         ``shown``, uint8 [N, *shape], is what the rows observed last, where that is at hand.
         """
         self._start_episodes(mask)
-        return self._keep(*self.engine.restart(self.state, mask, shown))
+        return self._keep(*self.engine.observe(self.state, None, mask, shown))[0]
 
     def _keep(self, state: RowState, result: T) -> T:
         """Change to a state; return the result."""

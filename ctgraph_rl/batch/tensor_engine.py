@@ -5,6 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from ctgraph_rl.batch.draw_ahead import DrawsAhead
+from ctgraph_rl.batch.native import Observed
 from ctgraph_rl.batch.params import Tables
 from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.dynamics import RowState, StateAndShown
@@ -13,7 +14,7 @@ from ctgraph_rl.core.tree import is_done
 
 
 class TensorEngine:
-    """Takes the steps of one batch on any device; every method returns the next states and what `Rows` shows of them.
+    """Takes the steps of one batch on any device; a method returns the next states and what rows show.
 
     Bind parameters before the first step.
     """
@@ -30,43 +31,37 @@ class TensorEngine:
         self.params = params
         self.uses = tables.uses
 
-    def reset(self, state: RowState, mask: Tensor) -> StateAndShown:
-        """See `Rows.reset`."""
-        words = self._draws.then(state.tick, mask)
-        state, shown = dynamics.reset(state, mask, self.params, self.uses, words)
+    def take(
+        self, state: RowState, action: Tensor | None, mask: Tensor | None, shown: Tensor | None = None
+    ) -> StateAndShown:
+        """See `Native.take`; ``shown`` is not needed."""
+        if action is None:
+            assert mask is not None
+            then = self._draws.then(state.tick, mask)
+            state, made = dynamics.reset(state, mask, self.params, self.uses, then)
+        else:
+            now = self._draws.now(state.tick)
+            then = self._draws.then(state.tick, 1)
+            words = (now, then)
+            if mask is None:
+                state, made = dynamics.step(state, action, self.params, self.uses, words)
+            else:
+                state, made = dynamics.step_or_reset(state, action, mask, self.params, self.uses, words=words)
+        self._draws.move(state.tick, then)
+        return state, made
+
+    def observe(
+        self, state: RowState, action: Tensor | None, mask: Tensor | None, shown: Tensor | None = None
+    ) -> tuple[RowState, Observed]:
+        """See `Native.observe`."""
+        if action is None:
+            words = self._draws.then(state.tick, 1 if mask is None else mask)
+            state, observation = dynamics.restart(state, mask, self.params, self.uses, words)
+        else:
+            now = self._draws.now(state.tick)
+            words = self._draws.then(state.tick, 1)
+            state = dynamics.advance(state, action, now, self.params, self.uses, absorbing=False)
+            observation = dynamics.observe(state, words, self.params, self.uses)
         self._draws.move(state.tick, words)
-        return state, shown
-
-    def step(self, state: RowState, action: Tensor) -> StateAndShown:
-        """See `Rows.step`."""
-        now = self._draws.now(state.tick)
-        then = self._draws.then(state.tick, 1)
-        state, shown = dynamics.step(state, action, self.params, self.uses, words=(now, then))
-        self._draws.move(state.tick, then)
-        return state, shown
-
-    def act(self, state: RowState, action: Tensor) -> tuple[RowState, tuple[Tensor, Tensor]]:
-        """See `Rows.act`."""
-        now = self._draws.now(state.tick)
-        then = self._draws.then(state.tick, 1)
-        state = dynamics.advance(state, action, now, self.params, self.uses, absorbing=False)
-        observation = dynamics.observe(state, then, self.params, self.uses)
-        self._draws.move(state.tick, then)
-        return state, (observation, is_done(state, self.params.tree))
-
-    def step_or_reset(self, state: RowState, action: Tensor, mask: Tensor) -> StateAndShown:
-        """See `Rows.step_or_reset`."""
-        now = self._draws.now(state.tick)
-        then = self._draws.then(state.tick, 1)
-        state, shown = dynamics.step_or_reset(
-            state, action, mask, params=self.params, uses=self.uses, words=(now, then)
-        )
-        self._draws.move(state.tick, then)
-        return state, shown
-
-    def restart(self, state: RowState, mask: Tensor | None, shown: Tensor | None) -> tuple[RowState, Tensor]:
-        """See `Rows.restart`; what the rows observed last is not needed."""
-        words = self._draws.then(state.tick, 1 if mask is None else mask)
-        state, observation = dynamics.restart(state, mask, self.params, self.uses, words)
-        self._draws.move(state.tick, words)
-        return state, observation
+        done = None if action is None else is_done(state, self.params.tree)
+        return state, (observation, done)
