@@ -95,7 +95,6 @@ def main() -> None:
 
 
 def _call() -> None:
-    """Do what the first word names."""
     words = sys.argv[1:]
     word = words[0] if words else "--help"
     if word in ("-h", "--help"):
@@ -128,7 +127,6 @@ def command(module: str) -> Callable[[], None]:
 
 
 def _start(module: str) -> None:
-    """Call the ``main`` of a module."""
     try:
         main = command(module)
     except ValueError as error:
@@ -174,7 +172,6 @@ def versions() -> str:
 
 
 def _unknown(word: str) -> str:
-    """Return why a word is no command, and what may have been meant."""
     conf = Path(conf_dir())
     groups = {path.name: f"{path.name}=NAME" for path in conf.iterdir() if path.is_dir()}
     files = {path.stem: f"{path.parent.name}={path.stem}" for path in conf.glob("*/*.yaml")}

@@ -130,7 +130,6 @@ def _overview(curriculum: Curriculum, frames_per_second: float | None) -> Sheet:
 
 
 def _of_graphs(curriculum: Curriculum, frames_per_second: float | None) -> dict[str, str]:
-    """Return what CT-graphs need of memory and time."""
     bank, per_row = memory(curriculum)
     evaluating = _duration(_evaluating(curriculum))
     return {
@@ -155,7 +154,6 @@ def _time(curriculum: Curriculum, frames_per_second: float | None) -> str:
 
 
 def _evaluating(curriculum: Curriculum) -> float:
-    """Return about how many seconds all evaluations take on one core."""
     how = curriculum.evaluation
     moments = how.before + (curriculum.num_frames // how.every if how.every else len(curriculum.ends))
     tasks = len(curriculum.tasks) / (2 if how.tasks == "seen" else 1) + len(how.held_out)
@@ -214,7 +212,6 @@ def _blocks(curriculum: Curriculum) -> Sheet:
 
 
 def _other_blocks(curriculum: Curriculum) -> Sheet:
-    """Return a row for each different task of a block, of tasks that are no CT-graphs."""
     labels = dict(zip(curriculum.tasks, curriculum.labels, strict=True))
     rows = []
     for number, block in enumerate(curriculum.blocks, 1):
@@ -237,7 +234,6 @@ def _block_rows(number: int, block: Block, labels: Mapping[TaskLike, str]) -> It
 
 
 def _difficulty(curriculum: Curriculum) -> Sheet:
-    """Closed forms of each task's graph: how large it is, how long its episodes, how sparse its reward."""
     rows = [(label, *_closed_forms(task)) for task, label in _labelled(curriculum)]
     sides = dict.fromkeys((*SIZES, *CLOSED_FORMS), "r")
     return Sheet("Tasks", {"task": "l", **sides}, tuple(rows), CLOSED_FORM_NOTES)
@@ -252,7 +248,6 @@ def _closed_forms(task: Task) -> tuple[str, ...]:
 
 
 def _ceilings(curriculum: Curriculum) -> Sheet:
-    """The best mean returns of policies that see less than all, or why they are not known."""
     rows = []
     reasons = []
     easy = []
@@ -286,7 +281,6 @@ def _ceiling(task: Task, ceiling: Callable[[Task], float]) -> tuple[float | None
 
 
 def _observations(curriculum: Curriculum) -> Sheet:
-    """Return what an observation leaves open about the state, and what varies where it is read."""
     rows = []
     reasons = []
     for task, label in _labelled(curriculum):

@@ -189,7 +189,6 @@ def open_own(path: Path, mode: str) -> BinaryIO:
 
 
 def _is_regular_or_missing(path: Path) -> bool:
-    """One look at a path, which another process may remove at any time."""
     try:
         return stat.S_ISREG(path.lstat().st_mode)
     except FileNotFoundError:

@@ -350,7 +350,6 @@ class CTGraphEnv(EnvBase):
         return data | self._counts(shown if isinstance(shown, Stepped) else self.rows)
 
     def _restarted(self, observation: Tensor, is_init: Tensor, running: RowData) -> RowData:
-        """Return the rows' data after the finished ones have started an episode; see `_not_done`."""
         return {"observation": observation, "is_init": is_init, **running, **self._counts(self.rows)}
 
     def _not_done(self) -> RowData:
@@ -363,7 +362,6 @@ class CTGraphEnv(EnvBase):
         return data
 
     def _counts(self, counts: Rows | Stepped) -> RowData:
-        """Return the rows' data that count over an episode, and their task ids."""
         keys = ("step_count", "episode_reward") if self.info else ()
         data = {key: getattr(counts, key).unsqueeze(-1) for key in keys}
         return data | {"task_id": self._shown_ids()} if self.num_task_ids else data
@@ -400,7 +398,6 @@ class CTGraphEnv(EnvBase):
         return super().set_seed(seed, static_seed)
 
     def _set_seed(self, seed: int | None) -> None:
-        """Restart all rows with another seed and their tasks' goals; the next `reset` gives their first episodes."""
         self.rows.set_seed(seed)  # type: ignore[arg-type]
 
 

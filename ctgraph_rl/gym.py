@@ -281,7 +281,6 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         return infos
 
     def _checked(self, actions: NDArray[np.int64]) -> Tensor:
-        """A copy of actions as the rows want them."""
         action = np.asarray(actions)
         last = self.rows.max_branching
         fits = action.shape == (self.num_envs,) and action.dtype.kind in "iu"
@@ -295,7 +294,6 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         return torch.from_numpy(action.astype(np.int64))
 
     def _mask(self, options: NamedValues | None) -> RowMask:
-        """The rows that a reset is for."""
         if options is None or "reset_mask" not in options:
             return np.ones(self.num_envs, np.bool_)
         mask = options["reset_mask"]
@@ -318,7 +316,6 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
             self._only(start, lambda: self.rows.set_streams(torch.from_numpy(self._seeds), row))
 
     def _spread_seed(self, seed: int | Sequence[int | None] | None) -> tuple[int | None, ...]:
-        """A seed or None for every row, from what `reset` is given."""
         seeds: Any = (None,) * self.num_envs if seed is None else as_tuple(seed)
         if isinstance(seed, int) and is_int(seed, 0):
             super().reset(seed=seed)
@@ -329,7 +326,6 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         return seeds
 
     def _change_tasks(self, mask: RowMask) -> None:
-        """Give the rows of a mask their next tasks."""
         if self._next_numbers is self._numbers:
             return
         change = mask & (self._next_numbers != self._numbers)
@@ -352,7 +348,6 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
 
 
 def _spaces(rows: Rows) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
-    """The spaces of one row."""
     white = 255 if len(rows.image_shape) == 3 else rows.white
     return spaces.Box(0, white, rows.image_shape, np.uint8), spaces.Discrete(rows.max_branching + 1)
 
@@ -390,7 +385,6 @@ def _known_mode(render_mode: str | None) -> str | None:
 
 
 def _frames(env: CTGraphGymEnv | CTGraphVectorEnv) -> tuple[Frame, ...] | None:
-    """A picture or a text of every row."""
     if env.render_mode is None:
         logger.warn("render() needs a render_mode, as in gymnasium.make(id, render_mode='rgb_array')")
         return None

@@ -51,7 +51,6 @@ def warn_of_shadows() -> None:
 
 
 def _shadows(*names: str) -> Iterator[str]:
-    """Yield what is wrong with packages of these names that are not ours."""
     for name in names:
         spec = find_spec(name)
         ours = HERE.parent / name

@@ -35,7 +35,6 @@ class RandomPolicy:
         return self._random_below(self.env.branching_factor + 1)
 
     def _random_below(self, high: Tensor) -> Tensor:
-        """An integer in [0, high) per row."""
         return (torch.rand(high.shape, dtype=torch.float64, device=high.device) * high).long()
 
 

@@ -121,13 +121,11 @@ def _has_variables() -> bool:
 
 
 def _lacking() -> list[str]:
-    """Return which of `NEEDED` this machine lacks."""
     there = _of_cpu("flags").split() if platform.machine() in ("x86_64", "AMD64") else []
     return [name for name in NEEDED if name not in there]
 
 
 def _of_cpu(field: str) -> str:
-    """Return a field of the first processor in Linux's list; empty where there is none."""
     path = Path("/proc/cpuinfo")
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
     return next((line.partition(":")[2].strip() for line in lines if line.split(":")[0].strip() == field), "")

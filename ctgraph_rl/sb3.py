@@ -56,7 +56,6 @@ class SB3VecEnv(VecEnv):
         self.metadata = self.envs.metadata
 
     def _shown(self, observation: NDArray[np.uint8], tasks: Any) -> Any:
-        """Observations with the ids of tasks, if there are ids."""
         return with_id(observation, self._ids, tasks)
 
     def reset(self) -> Any:
@@ -122,6 +121,5 @@ def _batch_rule(indices: VecEnvIndices) -> Rule:
 
 
 def _by_row(infos: NamedValues, **more: Any) -> list[NamedValues]:
-    """Gymnasium's batch of infos as a dictionary for every row."""
     rows = zip(*(infos[key].tolist() for key in ("task", "outcome", "leaf")), strict=True)
     return [{"task": task, "outcome": outcome, "leaf": leaf, **more} for task, outcome, leaf in rows]

@@ -106,7 +106,6 @@ class Assignment(NamedTuple):
         return following._replace(task=torch.where(mask, following.chosen, self.task))
 
     def _next_choice(self, switch: Switch, episodes: Tensor, place: EpisodePlace) -> Tensor:
-        """Return the choices after so many episodes; the switch's clock is that of a row, or of all together."""
         if switch.together:
             clock, past = ((n.sum() // len(n) - 1).expand_as(n) for n in (episodes, self.episodes))
             seed, row, tick = place

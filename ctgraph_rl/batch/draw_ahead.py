@@ -69,7 +69,6 @@ class DrawsAhead:
         return tuple(word.take(index) if used else index for word, used in pairs)  # what has no use is any tensor
 
     def _draw(self, first: Tensor) -> None:
-        """Make the draws of many ticks from the first ones on."""
         uses = self._uses
         ticks = first + torch.arange(self._num_ticks, device=first.device).unsqueeze(-1)
         self._first = first

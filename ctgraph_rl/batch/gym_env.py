@@ -134,7 +134,6 @@ class GymEnv(EnvBase):
             self._place(range(len(tasks)))
 
     def _place(self, rows: Iterable[int]) -> None:
-        """Give rows their next tasks, and put the environments of these in place."""
         tasks = list(self.tasks)
         for row in rows:
             task = self._next[row]
@@ -167,7 +166,6 @@ class GymEnv(EnvBase):
         return self._shown(data)
 
     def _begin(self, row: int) -> NDArray[Any]:
-        """Begin a row's present episode; return what it shows."""
         observed, _ = self._forms[self.tasks[row]]
         env = self._envs[row]
         return self._read(row, lambda seed: observed.read_first(_reset(env, seed)), self._episode_seed(row))
@@ -212,7 +210,6 @@ class GymEnv(EnvBase):
         return np.zeros((len(self.tasks), *observed.shape), dtype=observed.dtype)
 
     def _column(self, values: Sequence[float], dtype: torch.dtype) -> Tensor:
-        """Return a value of each row, [rows, 1]."""
         return torch.tensor(values, dtype=dtype, device=self.device).unsqueeze(-1)
 
     def _shown(self, data: dict[str, Tensor]) -> TensorDict:
@@ -220,7 +217,6 @@ class GymEnv(EnvBase):
         return TensorDict(data, batch_size=self.batch_size, device=self.device).clone()
 
     def _observed(self, seen: NDArray[Any]) -> dict[str, Tensor]:
-        """Return what rows show of their observations and tasks."""
         data = {"observation": torch.from_numpy(seen).to(self.device)}
         if self.num_task_ids:
             ids = torch.tensor([self._ids.get(task, -1) for task in self.tasks], device=self.device, dtype=torch.int64)
@@ -238,7 +234,6 @@ class GymEnv(EnvBase):
         return super().set_seed(seed, static_seed)
 
     def _set_seed(self, seed: int | None) -> None:
-        """Begin the episodes of another seed with the next reset."""
         require(seed_rule(seed))
         self.seed = seed  # type: ignore[assignment]
         self._episode[:] = -1
@@ -308,7 +303,6 @@ def _spec_of_actions(acted: ActionForm, rows: torch.Size) -> Any:
 
 
 def _same_spaces(pool: Sequence[GymTask]) -> Rule:
-    """Return the rule that tasks can be rows of one environment."""
     forms = []
     for task in pool:
         observed, acted = make_forms(task)
@@ -320,13 +314,11 @@ def _same_spaces(pool: Sequence[GymTask]) -> Rule:
 
 
 def _name(task: GymTask) -> str:
-    """Return an environment with its task, for errors."""
     label = task.label_parts["task"]
     return task.id if label == task.id else f"{task.id} ({label})"
 
 
 def _reset(env: Any, seed: int) -> Any:
-    """Return what an environment's reset with a seed returns."""
     try:
         return env.reset(seed=seed)
     except TypeError as error:

@@ -143,7 +143,6 @@ class Native:
         return None if wrong else (after, made)
 
     def _stepped_shapes(self) -> Stepped:
-        """Return tensors with the shapes and dtypes of what rows show after a step, of one element in memory each."""
         shapes = []
         for name in Stepped._fields:
             dtype, is_image, _ = _ARRAYS[name]
@@ -230,7 +229,6 @@ class Native:
         return RowState(*own)
 
     def _prepare(self) -> _Call:
-        """Return a call with all that stays the same between two changes of parameters."""
         params = self.params
         uses = self.tables.uses
         x = self.tables.x
@@ -275,7 +273,6 @@ def _pointers(tensors: Iterable[Tensor]) -> list[int]:
 
 
 def _set(call: _Call, name: str, array: Tensor | None, num_steps: int) -> Tensor | None:
-    """Put an array into the call, if it fits; it must be kept until then."""
     if array is None:
         setattr(call, name, None)
         return None

@@ -166,7 +166,6 @@ def _observation_params(tasks: _Different, bank: Bank) -> ObservationParams:
 
 
 def _taps(size: int, angles: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return what rotates an image of a size by each angle."""
     taps = [compute_taps(size, angle) for angle in range(angles)]
     index, weight = map(torch.stack, zip(*taps, strict=True))
     return index.to(device), weight.to(device)
@@ -184,12 +183,10 @@ def _first_view(task: Task, kind: StateType) -> int:
 
 
 def _num_ids(task: Task, kind: StateType) -> int:
-    """Return how many ids a state of a kind draws from."""
     return 1 if task.observations.is_unique(kind) else _length(task, kind)
 
 
 def _length(task: Task, kind: StateType) -> int:
-    """Return how many ids the range of a kind of state has."""
     first, last = task.observations.ids(kind)
     return last - first + 1
 
@@ -238,7 +235,6 @@ def _num_angles(task: Task) -> int:
 
 
 def _num_views(task: Task) -> int:
-    """Bank rows that one id of a task has."""
     return task.images.num_variants * (bank_key(task)[1] + 1)
 
 

@@ -95,7 +95,6 @@ def rollout(rows: Rows, policy: TensorPolicy | Tensor, steps: Steps, kernel: str
 
 
 def _native(rows: Rows, policy: TensorPolicy | Tensor, steps: Steps) -> RowState:
-    """Fill buffers by the C kernel; the states that the last step led to."""
     start = rows.state
     state = rows.native.run(start, mask=rows.is_done, observation=steps.observation[0])
     torch.eq(state.step_count, 0, out=steps.is_init[0])
@@ -109,7 +108,6 @@ def _native(rows: Rows, policy: TensorPolicy | Tensor, steps: Steps) -> RowState
 
 
 def _fill(rows: Rows, state: RowState, steps: Steps, part: slice) -> RowState:
-    """Take the steps of a part of the buffers, whose actions are there; the states that they lead to."""
     outputs = {name: getattr(steps, name)[part] for name in ("action", "reward", "done", "outcome")}
     seen = steps.observation[1:][part]
     is_init = steps.is_init[1:][part]
@@ -119,7 +117,6 @@ def _fill(rows: Rows, state: RowState, steps: Steps, part: slice) -> RowState:
 
 
 def _tensors(rows: Rows, policy: TensorPolicy | Tensor, steps: Steps) -> RowState:
-    """Fill buffers by the tensor engine; the states that the last step led to."""
     params = rows.params
     uses = rows.uses
     start = rows.state
@@ -148,7 +145,6 @@ def _tensors(rows: Rows, policy: TensorPolicy | Tensor, steps: Steps) -> RowStat
 
 
 def _chosen(rows: Rows, policy: TensorPolicy, steps: Steps, t: int, start: RowState) -> Tensor:
-    """Return the actions of a policy at step t; it must not change the rows."""
     params = rows.params
     action = policy(steps.observation[t], steps.is_init[t])
     same = rows.params is params and all(map(operator.is_, rows.state, start))

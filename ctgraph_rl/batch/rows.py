@@ -110,7 +110,6 @@ class Rows(TakesNumbers, nn.Module):
         self.set_tasks(tasks)
 
     def _make_images(self, noise_bank: int, device: torch.device | None) -> None:
-        """Make all images that the tasks of the pool show, and noise in advance."""
         bank = shared_bank(self.pool, self.num_rows, noise_bank)
         no_images = bank.images.new_empty(0, *bank.shape)
         self._bank = bank._replace(images=no_images, noises=no_images)
@@ -201,7 +200,6 @@ class Rows(TakesNumbers, nn.Module):
         self._choose(choices, torch.zeros_like(self.row), switch, at_episode_end)
 
     def _choose(self, choices: Tensor, choice: Tensor, switch: Switch | None, at_episode_end: bool) -> None:
-        """Give the rows choices from now on, or from their next episodes on."""
         chosen = Assignment(self.task, choice, torch.zeros_like(choice), choices, switch)
         if at_episode_end:
             self.assignment = chosen
@@ -216,7 +214,6 @@ class Rows(TakesNumbers, nn.Module):
         self._end_episodes()
 
     def _make_tables(self) -> None:
-        """Make the parameters of all tasks that the rows have or may change to, and of each row."""
         number = self.assignment.in_use
         tasks = tuple(self.pool[i] for i in number.tolist())
         self.tables = make_tables(tasks, number, self._bank)
@@ -224,13 +221,11 @@ class Rows(TakesNumbers, nn.Module):
         self._take_params()
 
     def _take_params(self) -> None:
-        """Give each row the parameters of its task."""
         self.tables = self.tables.assigned(self.task)
         images = (self.bank, self.noises, self.normal_table)
         self._bind(RowParams(self.seed, self.row, *self.tables.of_rows(), *images))
 
     def _bind(self, params: RowParams) -> None:
-        """Give both engines the parameters."""
         self.params = params
         self.tensors.bind(params, self.tables)
         self.native.bind(params, self.tables)
@@ -338,7 +333,6 @@ class Rows(TakesNumbers, nn.Module):
         return self._keep(*self.engine.observe(self.state, None, mask, shown))[0]
 
     def _keep(self, state: RowState, result: T) -> T:
-        """Change to a state; return the result."""
         self._buffers.update(zip(RowState._fields, state, strict=True))
         return result
 
@@ -375,7 +369,6 @@ class Rows(TakesNumbers, nn.Module):
             )
 
     def _end_episodes(self) -> None:
-        """End all episodes; the next one of every row has its task's goal."""
         self.goal_leaf = self.tables.row_goals
         self.state_type = torch.full_like(self.state_type, int(StateType.FAIL))
         self.episodes_left = torch.zeros_like(self.episodes_left)
@@ -389,7 +382,6 @@ class Rows(TakesNumbers, nn.Module):
         self._make_tables()
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Rows:
-        """Move what is no buffer along with the buffers."""
         super()._apply(fn, recurse)
 
         def moved(part: Any) -> Any:

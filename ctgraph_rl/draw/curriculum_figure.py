@@ -110,7 +110,6 @@ def _draw_panel(axes: Any, graph: CTGraph, goals: Mapping[Goal, str]) -> None:
 
 
 def _draw_edges(axes: Any, layout: Layout, places: Mapping[int, PlanePoint], goals: Iterable[int]) -> None:
-    """Draw the edges; the paths to goals are thick and black."""
     graph = layout.graph
     on_path = set(chain.from_iterable(map(graph.nodes_to, goals)))
     plain = stub_lines(layout, places, 0.45)

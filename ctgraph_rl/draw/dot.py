@@ -63,6 +63,5 @@ def _attributes(what: str, **values: str) -> str:
 
 
 def _quoted(text: str) -> str:
-    """Text that DOT shows unchanged."""
     escaped = terminal_lines(text).replace("\\", "\\\\").replace('"', '\\"')
     return '"' + escaped.replace("\n", "\\n") + '"'

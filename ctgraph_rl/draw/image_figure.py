@@ -57,7 +57,6 @@ def image_figure(task: Task, seed: int = 0) -> Any:
 
 
 def _plain(task: Task) -> list[ImageLine]:
-    """A line for each kind of state."""
     lines = []
     for kind in StateType:
         ids = _first_ids(task, kind, COLUMNS)
@@ -85,7 +84,6 @@ def _first_ids(task: Task, kind: StateType, most: int) -> list[int]:
 
 
 def _stored(task: Task, ids: list[int]) -> Tensor:
-    """The first stored image of each id."""
     return task.images.bank(0)[[place * task.images.num_variants for place in ids]]
 
 
@@ -106,7 +104,6 @@ def _reads(task: Task, shown: list[tuple[StateType, int]], count: int, seed: int
 
 
 def _pinned(task: Task, kind: StateType, number: int) -> Task:
-    """The task with one id for a kind of state."""
     name = kind.name.lower()
     changes: dict[str, Any] = {f"{name}_ids": (number, number)}
     if task.observations.is_unique(kind):
@@ -115,7 +112,6 @@ def _pinned(task: Task, kind: StateType, number: int) -> Task:
 
 
 def _draw_line(axes: Any, row: int, line: ImageLine, white: float) -> None:
-    """Images in cells of size 1, a row lower by `ROW` than the one before."""
     from matplotlib.patches import Rectangle
 
     top = -ROW * row

@@ -132,7 +132,6 @@ def _grid(vectors: Pixels) -> Pixels:
 
 
 def _draw_row(task: Task, kind: int, node: int, goal_leaf: int, size: int) -> Pixels:
-    """The right half of a row's picture in palette numbers."""
     graph = task.graph
     unit = size / 192
     is_leaf = node >= graph.num_decision_states
@@ -201,7 +200,6 @@ def _cross(canvas: Pixels, mark: Mark, reach: float, width: float, colour: int) 
 
 
 def _star(canvas: Pixels, mark: Mark, unit: float) -> None:
-    """A pentagram below a state, its middle filled."""
     x = mark.x
     y = mark.y + mark.radius + 10.5 * unit
     reach = 5.5 * unit

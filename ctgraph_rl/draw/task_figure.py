@@ -204,7 +204,6 @@ class _TaskPicture:
         )
 
     def _numbers(self, state: Key, actions: Sequence[int]) -> str:
-        """Probability and value of some actions of a state, the best of the values; empty without room."""
         if not self.has_numbers:
             return ""
         parts = []
@@ -225,7 +224,6 @@ class _TaskPicture:
                 self.axes.text(*place, words, fontsize=fits, color=ink, ha="center", va="center", zorder=4)
 
     def _words(self, state: Key) -> str:
-        """Return the text within a node."""
         if self.visits:
             return _short(self.visits.get(state, 0))
         return write_ids(self.task, state, self.layout.level[state[1]]) if self.ids else INITIALS[state[0]]
@@ -246,14 +244,12 @@ class _TaskPicture:
             self._note(in_digits(self.graph.path(end)), self.places[END, end], under, fontsize=6, ha="center", va="top")
 
     def _draw_loops(self) -> None:
-        """A ring at each wait state where waiting may stay there."""
         if self.graph.wait_prob > 0:
             points = [place for (kind, _), place in self.places.items() if kind == WAIT]
             ring = RING | {"markersize": 0.7 * self.size, "transform": self._moved(x=-0.55 * self.size)}
             self.axes.plot(*zip(*points, strict=True), zorder=2, **ring)
 
     def _moved(self, x: float = 0.0, y: float = 0.0) -> Any:
-        """Places in the tree moved by points."""
         from matplotlib.transforms import offset_copy
 
         return offset_copy(self.axes.transData, fig=self.axes.figure, x=x, y=y, units="points")
@@ -280,11 +276,9 @@ class _TaskPicture:
         return [action for action in range(most) if action not in right]
 
     def _note(self, words: str, place: PlanePoint, shift: PlanePoint, **style: Any) -> None:
-        """Words some points off a place."""
         self.axes.annotate(words, place, xytext=shift, textcoords="offset points", **style)
 
     def _draw_legend(self) -> None:
-        """Shapes and colours with their names, and what the lines mean."""
         from matplotlib.lines import Line2D
 
         kinds = [kind for kind in StateType if kind != WAIT or self.waits]
@@ -313,7 +307,6 @@ class _TaskPicture:
         return float(self.axes.figure.get_figwidth() / (1 if spec is None else spec.get_gridspec().ncols))
 
     def _meaning(self) -> str:
-        """Return the meaning of numbers and widths."""
         nodes = "visits" if self.visits else "observation ids" if self.ids else ""
         numbers = ["probability"] if self.policy and self.has_numbers else []
         numbers += ["Q"] if self.values and self.has_numbers else []
@@ -323,19 +316,16 @@ class _TaskPicture:
 
 
 def _probabilities(choice: Any, branching_factor: int) -> list[float]:
-    """Action probabilities as given; a greedy action has all."""
     if not isinstance(choice, Sequence) and getattr(choice, "ndim", 0) == 0:
         return [float(action == int(choice)) for action in range(max(branching_factor, int(choice)) + 1)]
     return [float(chance) for chance in choice]
 
 
 def _of(numbers: Sequence[float], actions: Sequence[int]) -> list[float]:
-    """The numbers of some actions, of those that have one."""
     return [numbers[action] for action in actions if action < len(numbers)]
 
 
 def _short(count: float) -> str:
-    """A number in few characters: 950, 12k, 3M."""
     if count >= 1e6:
         return f"{count / 1e6:.0f}M"
     return f"{count / 1e3:.0f}k" if count >= 1e4 else f"{count:.4g}"

@@ -48,7 +48,6 @@ def adapt(policy: Any, greedy: bool, num_actions: int | None, shows_ids: bool = 
 
 
 def _parts(shown: Any) -> tuple[Any, Any]:
-    """Return observations and one-hot task ids; None where the protocol shows none."""
     return (shown["observation"], shown["task_id"]) if isinstance(shown, dict) else (shown, None)
 
 

@@ -70,7 +70,6 @@ def make_env(
 
 
 def _env_rules(env: Any, kind: str, num_rows: int, num_task_ids: int) -> Iterator[Rule]:
-    """Yield the rules of what a kind of tasks makes; see `TaskLike.make_env`."""
     made = f"{kind}.make_env must return a TorchRL EnvBase of batch_size [{num_rows}]"
     is_env = isinstance(env, EnvBase)
     yield is_env and tuple(env.batch_size) == (num_rows,), f"{made}, got {env!r:.80}"
@@ -195,7 +194,6 @@ def act(env: EnvBase, policy: Policy, data: Step, start: Step) -> tuple[Step, St
 
 
 def _acts_on_tensors(policy: Policy) -> bool:
-    """Return whether a policy's ``act_on_tensors`` does all that a call does."""
     if "act_on_tensors" not in vars(type(policy)):
         return False
     return not (policy._forward_hooks or policy._forward_pre_hooks or policy._compiled_call_impl)  # type: ignore[attr-defined]
@@ -281,7 +279,6 @@ def take_step(env: EnvBase, data: Step) -> tuple[Step, Step]:
 
 
 def _append(steps: list[Step], step: Step, unstored: Sequence[str]) -> None:
-    """Append a step to those of a batch, and drop the states that the batch does not hold for each of them."""
     for key in unstored if steps else ():
         del steps[-1]["next", key], step[key]
     steps.append(step)

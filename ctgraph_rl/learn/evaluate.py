@@ -103,7 +103,6 @@ def evaluate(
 
 
 def _built_on(env: EnvBase, policy: type) -> Policy:
-    """Return a policy whose class is built on the environment that it acts in."""
     known = isinstance(env, CTGraphEnv) or not issubclass(policy, RandomPolicy)
     require((known, f"{policy.__name__} plays only CT-graphs: it knows their hidden state; give a policy of your own"))
     try:
@@ -118,7 +117,6 @@ def num_actions(env: EnvBase) -> int | None:
 
 
 def _first_episodes(env: EnvBase, policy: Policy, initial_state: InitialState | None, num_episodes: int) -> TensorDict:
-    """Return the last data of each row's first episodes, [rows, num_episodes]."""
     start = start_of_episodes(env, initial_state)
     first = env.reset().update(start)
     data = dict(first.items(True, True))
@@ -245,7 +243,6 @@ class Evaluator:
     def _measure(
         self, policies: Sequence[Policy], frames: int, moment: str, initial_state: InitialState | None
     ) -> None:
-        """Append one line for each task with the exact means of its policy."""
         curriculum = self.curriculum
         shape = agent_specs(curriculum).observation["observation"].shape
         for (task, named), policy in zip(self.tasks_at(frames).items(), policies, strict=True):
@@ -260,7 +257,6 @@ class Evaluator:
             self._append(named, frames, moment)("evaluation", episodes=None, **vars(measures), exact=True)
 
     def _append(self, named: tuple[int, str], frames: int, moment: str) -> Callable[..., None]:
-        """Return what appends a line on a task with a number and a label to the log."""
         number, label = named
         curriculum = self.curriculum
         return partial(

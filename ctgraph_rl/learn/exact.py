@@ -175,12 +175,10 @@ def _longest_stay(wait_prob: float) -> int:
 
 
 def _num_views(task: Task) -> int:
-    """Return how many images each id has, rotated ones included."""
     return task.images.num_variants * (task.observations.read_rotation + 1)
 
 
 def _of_function(policy: ActionProbs | nn.Module, task: Task, gamma: float) -> Measures:
-    """Return the exact measures of a function of images."""
     require((are_graphs([task]), f"exact values are those of CT-graphs, got {type(task).__name__}"))
     acts = as_policy(policy, task.num_actions) if isinstance(policy, nn.Module) else _Function(policy, task.num_actions)
     return exact_measures(acts, task, greedy=False, gamma=gamma)
@@ -301,7 +299,6 @@ class _Enumeration:
         return self.sums
 
     def _paid(self) -> Tensor:
-        """Return what end states pay, float64 [b^d]."""
         graph = self.task.graph
         leaf = torch.arange(graph.num_end_states, device="cpu")
         sizes = (torch.full_like(leaf, graph.branching_factor), torch.full_like(leaf, graph.depth))
@@ -390,7 +387,6 @@ class _Enumeration:
         return taken.select((weight > 0).nonzero().squeeze(1))
 
     def _count_steps(self, histories: _Histories) -> None:
-        """Count a step of all histories, and its reward."""
         self.sums.length_mean += histories.weight.sum().item()
         self.sums.return_mean += self.task.step_reward * (histories.weight * histories.discount).sum().item()
 
@@ -411,14 +407,12 @@ class _Enumeration:
 
 
 def _parts(histories: _Histories) -> Iterator[_Histories]:
-    """Yield parts of histories that are played at once; none where there is none."""
     for rows in torch.arange(len(histories.node), device="cpu").split(HISTORIES_AT_ONCE):
         if len(rows):
             yield histories.select(rows)
 
 
 def _joined(parts: Sequence[_Histories]) -> _Histories:
-    """Return histories as one."""
     state = {key: torch.cat([part.state[key] for part in parts]) for key in parts[0].state}
     node, weight, discount = (
         torch.cat([getattr(part, name) for part in parts]) for name in ("node", "weight", "discount")

@@ -80,7 +80,6 @@ class LogitsPolicy:
 
 
 def _takes_ids(function: Any) -> bool:
-    """Return whether a function needs two positional arguments, or its second one is named ``task_id``."""
     try:
         places = positional(function)
     except ValueError:  # of a traced module, which has none

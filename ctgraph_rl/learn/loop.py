@@ -207,7 +207,6 @@ class Lockstep:
         self._batches = self._learn_batches(saved)
 
     def _make_env(self, device: torch.device) -> EnvBase:
-        """Return an environment with the rows of each seed as in a single run, one seed after the other."""
         num_envs = self.group.agents[0].num_envs
         count = len(self.seeds)
         tasks = count * self.curriculum.blocks[0].rows(num_envs)
@@ -241,7 +240,6 @@ class Lockstep:
         return next(self._batches, False)
 
     def _learn_batches(self, saved: Sequence[SavedState] | None) -> Iterator[bool]:
-        """Learn block by block, a batch at each step; evaluate at the moments that the curriculum says."""
         if len(self.failed) == len(self.logs):
             return
         if saved is None:
@@ -269,7 +267,6 @@ class Lockstep:
     def _collect(
         self, segment: Segment, restore: Callable[[], TensorDictBase] | None
     ) -> Iterator[tuple[TensorDictBase, TensorDictBase]]:
-        """Yield the batches that are left of a segment."""
         return collect_segment(
             segment,
             self.env,
@@ -289,7 +286,6 @@ class Lockstep:
                 evaluator.evaluate_if_due(agent, frames)
 
     def _learn(self, batch: TensorDictBase, segment: Segment) -> None:
-        """Let all learn from a batch, and log what they measure."""
         start = self.frames
         self.frames += batch.numel() // len(self.logs)
         self.batch = batch
@@ -330,7 +326,6 @@ class Lockstep:
         return states
 
     def _restore(self, saved: Sequence[SavedState]) -> TensorDictBase:
-        """Restore saved states; return the data that the next step starts from."""
         self._restore_agents(saved)
         with saved_state_fits():
             self.env.load_state_dict(_joined([state["env"] for state in saved]))
@@ -339,7 +334,6 @@ class Lockstep:
         return data[0] if len(data) == 1 else torch.cat(data)
 
     def _restore_agents(self, saved: Sequence[SavedState]) -> None:
-        """Restore the agents of saved states, and what they draw from."""
         with saved_state_fits():
             for agent, state in zip(self.group.agents, saved, strict=True):
                 agent.load_state_dict(state["agent"])
@@ -347,7 +341,6 @@ class Lockstep:
             self._set_random_state(number, state)
 
     def _random_state(self, number: int) -> NamedValues:
-        """Return the state of what an agent draws from."""
         device = self.env.device
         if self.group.generators is not None:
             draws = self.group.device_generators
@@ -357,7 +350,6 @@ class Lockstep:
         return {"random": torch.get_rng_state(), "random_cuda": of_cuda}
 
     def _set_random_state(self, number: int, state: SavedState) -> None:
-        """Restore what `_random_state` returned."""
         if self.group.generators is not None:
             self.group.generators[number].set_state(state["random"])
             if self.group.device_generators is not None:
@@ -398,7 +390,6 @@ def _finite(measured: Learnt) -> dict[str, float]:
 
 
 def _divided(state: NamedValues, count: int) -> list[NamedValues]:
-    """Return the state of an environment's rows for each member."""
     if count == 1:
         return [state]
     parts: list[NamedValues] = [{} for _ in range(count)]
@@ -409,7 +400,6 @@ def _divided(state: NamedValues, count: int) -> list[NamedValues]:
 
 
 def _joined(states: Sequence[NamedValues]) -> NamedValues:
-    """Return the state of an environment with the rows of all members."""
     if len(states) == 1:
         return states[0]
     return {key: torch.cat([state[key] for state in states]) for key in states[0]}

@@ -120,7 +120,6 @@ def _steps_of_trial(curriculum: Curriculum, agent: Agent) -> int:
 
 
 def _has_distribution(block: Block) -> bool:
-    """Return whether a block has several tasks, or a task with several goals."""
     return len(set(block.tasks)) > 1 or getattr(block.tasks[0], "goal_change", None) is not None
 
 

@@ -99,7 +99,6 @@ def collect_segment(
 
 
 def _set_tasks(env: EnvBase, block: Block, num_seeds: int, at_episode_end: bool = False) -> None:
-    """Give an environment the tasks of a block, the rows of each seed the same."""
     if block.switch is None:
         env.set_tasks(num_seeds * block.rows(env.numel() // num_seeds), at_episode_end)
     else:

@@ -71,7 +71,6 @@ def select(arguments: argparse.Namespace) -> Selection:
 
 
 def _named(name: str | None, number: int, changes: NamedValues, config_dir: Path | None) -> Selection:
-    """Return a task without a policy."""
     own = name in curriculum_names(config_dir)
     if name is None:
         return _called("CT-graph", make_task(**changes))

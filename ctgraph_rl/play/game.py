@@ -184,7 +184,6 @@ def picture(observation: NDArray[np.uint8], white: float, colours: bool) -> Text
 
 
 def _blocks(levels: NDArray[np.int_]) -> Text:
-    """Greys of 24 bits: the upper half of a cell is its text, the lower half its background."""
     levels = np.pad(levels, ((0, len(levels) % 2), (0, 0)))
     text = Text()
     for upper, lower in zip(levels[::2], levels[1::2], strict=True):
@@ -195,7 +194,6 @@ def _blocks(levels: NDArray[np.int_]) -> Text:
 
 
 def _shades(levels: NDArray[np.int_], times: int) -> Text:
-    """Two characters wide for each one high, as cells are twice as high as wide."""
     shown = (levels * len(SHADES) // 256).repeat(times, 0).repeat(2 * times, 1)
     return Text("\n".join("".join(SHADES[level] for level in line) for line in shown.tolist()) + "\n")
 

@@ -33,7 +33,6 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _write(selection: Selection, arguments: argparse.Namespace) -> None:
-    """Write all that is asked for."""
     film = arguments.gif is None or selection.policy is not None, "a film needs a policy: name a --policy or a --run"
     require(film, *at_least_one(dpi=arguments.dpi, episodes=arguments.episodes))
     if arguments.figure is not None:
