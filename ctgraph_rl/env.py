@@ -9,6 +9,7 @@ import torch
 from tensordict import LazyStackedTensorDict, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
+from typing_extensions import override
 
 from ctgraph_rl.batch.assignment import checked_num_ids, one_hot_ids
 from ctgraph_rl.batch.native import Stepped
@@ -393,8 +394,8 @@ class CTGraphEnv(EnvBase):
         return render(self.tasks, self.state_type, self.node, self.goal_leaf, observation, size=size)
 
     @takes_numbers
+    @override
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
-        """Restart all rows with another seed, as every TorchRL environment does; return the seed for a next one."""
         return super().set_seed(seed, static_seed)
 
     def _set_seed(self, seed: int | None) -> None:

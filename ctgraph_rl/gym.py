@@ -6,8 +6,7 @@ Importing this module registers the ids ``ctgraph/CTGraph-v0``, ``ctgraph/CT-FO-
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -78,9 +77,13 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
         kernel: str = "auto",
         **changes: Any,
     ) -> None:
-        with _one_thread():
+        num_threads = torch.get_num_threads()
+        torch.set_num_threads(1)  # `AsyncVectorEnv` forks the process, and a fork with threads waits for ever
+        try:
             task = make_task(task, config, **changes)
             self.rows = Rows([task], task_pool=task_pool, kernel=kernel)
+        finally:
+            torch.set_num_threads(num_threads)
         self.task_pool = self.rows.pool
         self.render_mode = _known_mode(render_mode)
         images, self.action_space = _spaces(self.rows)
@@ -197,7 +200,10 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         self.rows = Rows(tasks, task_pool=task_pool, kernel=kernel)
         self.task_pool = self.rows.pool
         self.render_mode = _known_mode(render_mode)
-        self.autoreset_mode = _autoreset_mode(autoreset_mode)
+        modes = [mode.value for mode in AutoresetMode]
+        is_mode = autoreset_mode in (*modes, *AutoresetMode)
+        require((is_mode, f"autoreset_mode must be one of {modes}, got {autoreset_mode!r}"))
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**_RENDERING, "autoreset_mode": self.autoreset_mode}
         images, self.single_action_space = _spaces(self.rows)
         self.single_observation_space, self._ids = with_task_ids(images, self.task_pool, task_ids, num_task_ids)
@@ -228,7 +234,13 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         Raises:
             ValueError: for wrong seeds and masks, and a mask in the very first reset.
         """
-        mask = self._mask(options)
+        mask = np.ones(self.num_envs, np.bool_)
+        if options is not None and "reset_mask" in options:
+            mask = options["reset_mask"]
+            fits = isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.shape == (self.num_envs,)
+            rule = f"reset_mask must be a bool array of shape [{self.num_envs}] with a row to reset, got {mask!r}"
+            require((fits and bool(mask.any()), rule), (self._is_seeded, "the first reset must be of all rows"))
+            mask = mask.copy()
         self._start_streams(mask, seed)
         self._change_tasks(mask)
         self._is_over = self._is_over & ~mask
@@ -293,18 +305,15 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
             raise ValueError(f"no episode is running in the rows {rows}: reset them first")
         return torch.from_numpy(action.astype(np.int64))
 
-    def _mask(self, options: NamedValues | None) -> RowMask:
-        if options is None or "reset_mask" not in options:
-            return np.ones(self.num_envs, np.bool_)
-        mask = options["reset_mask"]
-        fits = isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.shape == (self.num_envs,)
-        rule = f"reset_mask must be a bool array of shape [{self.num_envs}] with a row to reset, got {mask!r}"
-        require((fits and bool(mask.any()), rule), (self._is_seeded, "the first reset must be of all rows"))
-        return mask.copy()
-
     def _start_streams(self, mask: RowMask, seed: int | Sequence[int | None] | None) -> None:
         """Start random streams in the rows of a mask that are given a seed, and in all at first."""
-        seeds = self._spread_seed(seed)
+        seeds: Any = (None,) * self.num_envs if seed is None else as_tuple(seed)
+        if isinstance(seed, int) and is_int(seed, 0):
+            super().reset(seed=seed)
+            seeds = tuple(range(seed, seed + self.num_envs))
+        fits = isinstance(seeds, tuple) and len(seeds) == self.num_envs
+        require((fits, f"seed must be an integer or one or None per row, {self.num_envs} in all, got {seed!r}"))
+        require(*map(_seed_rule, seeds))
         given = np.array([one is not None for one in seeds])
         start = mask & given if self._is_seeded else mask
         if start.any():
@@ -314,16 +323,6 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
             self._is_seeded = True
             row = torch.zeros(self.num_envs, dtype=torch.int64, device="cpu")
             self._only(start, lambda: self.rows.set_streams(torch.from_numpy(self._seeds), row))
-
-    def _spread_seed(self, seed: int | Sequence[int | None] | None) -> tuple[int | None, ...]:
-        seeds: Any = (None,) * self.num_envs if seed is None else as_tuple(seed)
-        if isinstance(seed, int) and is_int(seed, 0):
-            super().reset(seed=seed)
-            seeds = tuple(range(seed, seed + self.num_envs))
-        fits = isinstance(seeds, tuple) and len(seeds) == self.num_envs
-        require((fits, f"seed must be an integer or one or None per row, {self.num_envs} in all, got {seed!r}"))
-        require(*map(_seed_rule, seeds))
-        return seeds
 
     def _change_tasks(self, mask: RowMask) -> None:
         if self._next_numbers is self._numbers:
@@ -350,23 +349,6 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
 def _spaces(rows: Rows) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
     white = 255 if len(rows.image_shape) == 3 else rows.white
     return spaces.Box(0, white, rows.image_shape, np.uint8), spaces.Discrete(rows.max_branching + 1)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Keep torch from starting threads: `AsyncVectorEnv` forks the process, and a fork with threads waits for ever."""
-    num_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(num_threads)
-
-
-def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
-    choices = [choice.value for choice in AutoresetMode]
-    require((mode in choices or mode in list(AutoresetMode), f"autoreset_mode must be one of {choices}, got {mode!r}"))
-    return AutoresetMode(mode)
 
 
 def _seed_rule(seed: object) -> Rule:

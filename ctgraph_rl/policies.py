@@ -10,6 +10,7 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from typing_extensions import override
 
 from ctgraph_rl.core.graph import WAIT_ACTION, StateType
 from ctgraph_rl.core.tree import branch_of
@@ -41,8 +42,8 @@ class RandomPolicy:
 class NavigationPolicy(RandomPolicy):
     """Waits where it must and decides at random; it reaches the goal with probability b^-d."""
 
+    @override
     def action(self, tensordict: TensorDictBase) -> Tensor:
-        """The actions of all rows."""
         decides = self.env.state_type == StateType.DECISION
         return torch.where(decides, self.decision(tensordict), WAIT_ACTION)
 
@@ -61,8 +62,8 @@ class OptimalPolicy(NavigationPolicy):
         6
     """
 
+    @override
     def decision(self, tensordict: TensorDictBase) -> Tensor:
-        """Return the decision of each row, in 1..b, for rows at a decision state."""
         return self._towards(self.env.goal_leaf)
 
     def _towards(self, leaf: Tensor) -> Tensor:
@@ -94,13 +95,13 @@ class SearchPolicy(OptimalPolicy):
         self.target: Tensor | None = None
         self.missed = torch.zeros_like(env.node, dtype=torch.bool)
 
+    @override
     def decision(self, tensordict: TensorDictBase) -> Tensor:
-        """Return the decision of each row, in 1..b, for rows at a decision state."""
         assert self.target is not None
         return self._towards(self.target)
 
+    @override
     def action(self, tensordict: TensorDictBase) -> Tensor:
-        """The actions of all rows; a new episode tries the next end state if the last one ended without the goal."""
         if self.target is None:
             self.target = self._random_below(self.env.num_end_states)
         fails = tensordict.get("is_init").squeeze(-1) & self.missed

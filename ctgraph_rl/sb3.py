@@ -8,6 +8,7 @@ from typing import Any, cast
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from ctgraph_rl.batch.shown_ids import with_id, with_task_ids
 from ctgraph_rl.checks import NamedValues, Rule, require, takes_numbers
@@ -66,8 +67,8 @@ class SB3VecEnv(VecEnv):
         self.reset_infos = _by_row(infos)
         return self._shown(observation, infos["task"])
 
+    @override
     def step_async(self, actions: NDArray[np.int64]) -> None:
-        """Take actions for the next `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -84,12 +85,12 @@ class SB3VecEnv(VecEnv):
                 infos[i] |= final[i] | {"terminal_observation": last}
         return self._shown(observation, batch["task"]), rewards.astype(np.float32), done, infos
 
+    @override
     def close(self) -> None:
-        """Nothing is held open."""
         self.envs.close()
 
+    @override
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
-        """A picture of every row, with ``render_mode="rgb_array"``."""
         frames = self.envs.render() if self.render_mode == "rgb_array" else None
         return cast("Sequence[NDArray[np.uint8] | None]", frames or [None] * self.num_envs)
 
@@ -111,8 +112,8 @@ class SB3VecEnv(VecEnv):
         result = getattr(self.envs, method_name)(*args, **kwargs)
         return list(result) if isinstance(result, tuple) else [result] * self.num_envs
 
+    @override
     def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> list[bool]:
-        """Rows are never wrapped."""
         return [False for _ in self._get_indices(indices)]
 
 

@@ -13,6 +13,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Unbounded
 from torchrl.envs import EnvBase
+from typing_extensions import override
 
 from ctgraph_rl.batch.assignment import checked_num_ids, one_hot_ids
 from ctgraph_rl.batch.rows import seed_rule
@@ -229,8 +230,8 @@ class GymEnv(EnvBase):
         return int(sequence.generate_state(1)[0] >> 1)
 
     @takes_numbers
+    @override
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
-        """Begin the episodes of another seed with the next reset; see ``EnvBase``."""
         return super().set_seed(seed, static_seed)
 
     def _set_seed(self, seed: int | None) -> None:

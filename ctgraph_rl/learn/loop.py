@@ -302,7 +302,10 @@ class Lockstep:
                 seed = "" if self.group.generators is None else f"seed {self.seeds[number]}: "
                 self.failed[number] = FloatingPointError(f"{seed}{error} {where}")
                 continue
-            self.returns.append(log_training(self.logs[number], self.curriculum, parts[number], start, measurements))
+            events = getattr(self.group.agents[number], "events", ())
+            log = self.logs[number]
+            part = parts[number]
+            self.returns.append(log_training(log, self.curriculum, part, start, measurements, events=events))
 
     def state(self) -> list[NamedValues]:
         """Return all that the rest of each member's run depends on, as tensors and plain values."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from itertools import accumulate, pairwise
 from typing import NamedTuple
 
@@ -17,9 +17,6 @@ from ctgraph_rl.learn.guide import Guide, guided_share
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Block
-
-AT_THE_END = {"alarm", "rolled_back"}
-"""Measurements of the end of a batch, which are 0 in its other parts."""
 
 
 class Segment(NamedTuple):
@@ -119,17 +116,33 @@ def guided(frames: int, curriculum: Curriculum) -> dict[str, float]:
 
 
 def log_training(
-    log: RunLog, curriculum: Curriculum, batch: TensorDictBase, start: int, measurements: Mapping[str, float]
+    log: RunLog,
+    curriculum: Curriculum,
+    batch: TensorDictBase,
+    start: int,
+    measurements: Mapping[str, float],
+    *,
+    events: Collection[str] = (),
 ) -> float:
-    """Append a line for each block that a batch has frames of; return the mean return of the last line."""
+    """Append a line for each block that a batch has frames of; return the mean return of the last line.
+
+    Args:
+        log: where lines are appended.
+        curriculum: what is learned.
+        batch: [rows, steps].
+        start: frames before it.
+        measurements: of the batch.
+        events: names of measurements of the batch's end, which are 0 in its other parts.
+    """
     frames = start
     end = start + batch.numel()
     for part in _of_one_block(batch, start, curriculum.ends):
         frames += part.numel()
         after = part["next"]
         episodes = episode_means(after.select(*EPISODE_KEYS, strict=False)[after["done"].squeeze(-1)])
-        events = {} if frames == end else dict.fromkeys(measurements.keys() & AT_THE_END, 0)
-        measured = episodes | dict(measurements) | events
+        measured = episodes | dict(measurements)
+        if frames != end:
+            measured |= dict.fromkeys(measurements.keys() & set(events), 0)
         log.append("training", block=curriculum.block_at(frames), frames=frames, **measured)
     return episodes["return_mean"]
 

@@ -144,6 +144,9 @@ class SelfLabelledAgent(nn.Module):
         max_labels: most labels.
     """
 
+    events = ("alarm", "rolled_back")
+    """What it measures at the end of a batch."""
+
     def __init__(self, learner: Agent, detector: Judge, policy: nn.Module, max_labels: int) -> None:
         super().__init__()
         self.learner: Any = learner
