@@ -114,7 +114,6 @@ def describe(curriculum: Curriculum, frames_per_second: float | None = None) -> 
 
 
 def _overview(curriculum: Curriculum, frames_per_second: float | None) -> Sheet:
-    graphs = are_graphs(curriculum.tasks)
     rows = {
         "version": str(curriculum.version),
         "fingerprint": curriculum.fingerprint,
@@ -124,18 +123,13 @@ def _overview(curriculum: Curriculum, frames_per_second: float | None) -> Sheet:
         "frames": f"{curriculum.num_frames:,}",
         "protocol": protocol_in_words(curriculum.protocol, len(curriculum.tasks)),
         "evaluation": evaluation_in_words(curriculum.evaluation),
-        **(_of_graphs(curriculum, frames_per_second) if graphs else {}),
     }
+    if are_graphs(curriculum.tasks):
+        bank, per_row = memory(curriculum)
+        evaluations = _duration(_evaluation_seconds(curriculum))
+        rows["memory"] = f"{bank:,} bytes of images, and {per_row:,} for each row"
+        rows["time"] = f"{_time(curriculum, frames_per_second)}; {evaluations} for evaluations, estimated"
     return Sheet(curriculum.name, {"what": "l", "value": "l"}, tuple(rows.items()))
-
-
-def _of_graphs(curriculum: Curriculum, frames_per_second: float | None) -> dict[str, str]:
-    bank, per_row = memory(curriculum)
-    evaluating = _duration(_evaluating(curriculum))
-    return {
-        "memory": f"{bank:,} bytes of images, and {per_row:,} for each row",
-        "time": f"{_time(curriculum, frames_per_second)}; {evaluating} for evaluations, estimated",
-    }
 
 
 def _graphs(curriculum: Curriculum) -> Sequence[Task]:
@@ -153,7 +147,7 @@ def _time(curriculum: Curriculum, frames_per_second: float | None) -> str:
     return f"{_duration(seconds)} at {rate:,.0f} frames/s, the rate of agent={AGENT} on one core (--frames-per-second)"
 
 
-def _evaluating(curriculum: Curriculum) -> float:
+def _evaluation_seconds(curriculum: Curriculum) -> float:
     how = curriculum.evaluation
     moments = how.before + (curriculum.num_frames // how.every if how.every else len(curriculum.ends))
     tasks = len(curriculum.tasks) / (2 if how.tasks == "seen" else 1) + len(how.held_out)
@@ -234,17 +228,15 @@ def _block_rows(number: int, block: Block, labels: Mapping[TaskLike, str]) -> It
 
 
 def _difficulty(curriculum: Curriculum) -> Sheet:
-    rows = [(label, *_closed_forms(task)) for task, label in _labelled(curriculum)]
+    rows = []
+    for task, label in _labelled(curriculum):
+        graph = task.graph
+        sizes = (graph.num_states, graph.num_end_states)
+        probs = (graph.reward_prob_random, graph.end_prob_random, graph.reward_prob_navigation)
+        lengths = (graph.expected_episode_length, graph.expected_search_episodes, random_frames_to_goal(task))
+        rows.append((label, *map(_number, (*sizes, *probs, *lengths))))
     sides = dict.fromkeys((*SIZES, *CLOSED_FORMS), "r")
     return Sheet("Tasks", {"task": "l", **sides}, tuple(rows), CLOSED_FORM_NOTES)
-
-
-def _closed_forms(task: Task) -> tuple[str, ...]:
-    graph = task.graph
-    sizes = (graph.num_states, graph.num_end_states)
-    probs = (graph.reward_prob_random, graph.end_prob_random, graph.reward_prob_navigation)
-    lengths = (graph.expected_episode_length, graph.expected_search_episodes, random_frames_to_goal(task))
-    return tuple(map(_number, (*sizes, *probs, *lengths)))
 
 
 def _ceilings(curriculum: Curriculum) -> Sheet:

@@ -115,9 +115,6 @@ class CTGraphEnv(EnvBase):
         self._task_id: tuple[Tensor | None, Tensor] = None, numbers
         self._steps: list[TensorDictBase] | None = None
         self._running: RowData = {}
-        self._make_specs()
-
-    def _make_specs(self) -> None:
         specs = specs_of(self.rows.pool, self.batch_size, self.num_task_ids, self.info)
         self.observation_spec = specs.observation.to(self.device)
         self.action_spec = specs.action.to(self.device)

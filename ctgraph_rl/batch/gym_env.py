@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Unbounded
+from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 from typing_extensions import override
 
@@ -21,7 +21,7 @@ from ctgraph_rl.batch.specs import done_spec, observation_spec, reward_spec
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule, require, require_all, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import beside
-from ctgraph_rl.tasks.kinds.gym_spaces import ActionForm, ObservationForm
+from ctgraph_rl.tasks.kinds.gym_spaces import ActionForm
 from ctgraph_rl.tasks.kinds.gym_task import GymTask, make_forms, registered
 from ctgraph_rl.tasks.kinds.task_like import close_env
 
@@ -95,14 +95,14 @@ class GymEnv(EnvBase):
         except BaseException:
             self.close()
             raise
-        self._make_specs()
-
-    def _make_specs(self) -> None:
         rows = self.batch_size
         observed, acted = self._forms[self.pool[0]]
-        seen = _spec_of_observations(observed, (*rows, *observed.shape))
+        shape = (*rows, *observed.shape)
+        seen: TensorSpec = Unbounded(shape=shape, dtype=torch.float32, device="cpu")
+        if observed.dtype == np.uint8:
+            seen = Bounded(0, observed.largest, shape=shape, dtype=torch.uint8, device="cpu")
         self.observation_spec = observation_spec(seen, rows, self.num_task_ids).to(self.device)
-        self.action_spec = _spec_of_actions(acted, rows).to(self.device)
+        self.action_spec = _make_action_spec(acted, rows).to(self.device)
         self.reward_spec = reward_spec(rows).to(self.device)
         self.full_done_spec = done_spec(rows).to(self.device)
         self._data = {**self.observation_spec.zero(), **self.full_done_spec.zero()}
@@ -287,13 +287,7 @@ class GymEnv(EnvBase):
 FIX = "make reset(seed=...) decide all of an episode, or give GymTask(repeats=False)"
 
 
-def _spec_of_observations(observed: ObservationForm, shape: tuple[int, ...]) -> Any:
-    if observed.dtype == np.uint8:
-        return Bounded(0, observed.largest, shape=shape, dtype=torch.uint8, device="cpu")
-    return Unbounded(shape=shape, dtype=torch.float32, device="cpu")
-
-
-def _spec_of_actions(acted: ActionForm, rows: torch.Size) -> Any:
+def _make_action_spec(acted: ActionForm, rows: torch.Size) -> Any:
     if acted.num_actions is not None:
         return Categorical(acted.num_actions, shape=rows, dtype=torch.int64, device="cpu")
     shape = (*rows, *acted.shape)

@@ -171,7 +171,7 @@ class Native:
         Raises:
             ValueError: for arrays of a wrong shape or dtype, and for states that the rows' tasks cannot have.
         """
-        after, wrong = self._run(state, num_steps, restarts, made=made, **arrays)
+        after, wrong = self._run(state, num_steps, restarts, -1, made, **arrays)
         require((wrong == 0, "the rows' states are none of their tasks: they have images outside the bank"))
         return after
 

@@ -86,8 +86,18 @@ def make_tables(tasks: tuple[Task, ...], number: Tensor, bank: Bank) -> Tables:
     """Return the tables of different tasks with these numbers in their pool; no row has one yet."""
     different = _Different(tasks, number.device)
     reward_fns = tuple(dict.fromkeys(task.reward_fn for task in tasks))
+    extra_end_step = different.each("extra_end_step", torch.bool)
+    swapped_node = different.each(lambda task: -1 if task.swapped_node is None else task.swapped_node)
+    branches = different.each(lambda task: task.swapped_branches[1] if task.swapped_branches else (0, 0))
+    swap = Swap(swapped_node, *branches.unbind(1))
     return Tables(
-        tree=_tree_params(different),
+        tree=tree_params(
+            branching_factor=different.each("graph.branching_factor"),
+            first_leaf=different.each("graph.num_decision_states"),
+            stay_below=different.each(lambda task: int(task.graph.wait_prob * 2**63)),
+            extra_end_step=extra_end_step if different.some("extra_end_step") else None,
+            swap=swap if different.some("swapped_branches") else None,
+        ),
         x=_observation_params(different, bank),
         g=_reward_params(different, reward_fns),
         goal_leaf=different.each("goal_leaf"),
@@ -118,30 +128,14 @@ def _uses(tasks: _Different, bank: Bank, reward_fns: tuple[RewardFn, ...]) -> Us
     )
 
 
-def _tree_params(tasks: _Different) -> TreeParams:
-    extra_end_step = tasks.each("extra_end_step", torch.bool)
-    return tree_params(
-        branching_factor=tasks.each("graph.branching_factor"),
-        first_leaf=tasks.each("graph.num_decision_states"),
-        stay_below=tasks.each(lambda task: int(task.graph.wait_prob * 2**63)),
-        extra_end_step=extra_end_step if tasks.some("extra_end_step") else None,
-        swap=_swap(tasks) if tasks.some("swapped_branches") else None,
-    )
-
-
-def _swap(tasks: _Different) -> Swap:
-    node = tasks.each(lambda task: -1 if task.swapped_node is None else task.swapped_node)
-    branches = tasks.each(lambda task: task.swapped_branches[1] if task.swapped_branches else (0, 0))
-    return Swap(node, *branches.unbind(1))
-
-
 def _observation_params(tasks: _Different, bank: Bank) -> ObservationParams:
     each = tasks.each
     most_angles = max(map(_num_angles, tasks.tasks))
     first_kind = len(StateType) * torch.arange(len(tasks.tasks), device=tasks.device)
 
     def first_view(task: Task, kind: StateType) -> int:
-        return bank.start[bank_key(task)] + _first_view(task, kind)
+        skipped = task.graph.num_decision_states if kind == StateType.END and _is_by_node(task, kind) else 0
+        return bank.start[bank_key(task)] + (task.observations.ids(kind)[0] - skipped) * _num_views(task)
 
     def first_noise(task: Task) -> int:
         return bank.noise_levels.index(task.observations.read_noise) * bank.num_noises
@@ -150,7 +144,7 @@ def _observation_params(tasks: _Different, bank: Bank) -> ObservationParams:
         first_kind=first_kind if len(tasks.tasks) > 1 else None,
         first_view=tasks.each_kind(first_view),
         views_per_node=tasks.each_kind(lambda task, kind: _num_views(task) * _is_by_node(task, kind)),
-        num_ids=tasks.each_kind(_num_ids),
+        num_ids=tasks.each_kind(lambda task, kind: 1 if task.observations.is_unique(kind) else _length(task, kind)),
         bank_start=each(lambda task: bank.start[bank_key(task)]),
         num_views=each(_num_views),
         num_angles=each(_num_angles),
@@ -174,16 +168,6 @@ def _taps(size: int, angles: int, device: torch.device) -> tuple[Tensor, Tensor]
 def _is_by_node(task: Task, kind: StateType) -> bool:
     """Whether each state of a kind has an image that is numbered as its node."""
     return task.observations.is_unique(kind) and not task.observations.legacy_index
-
-
-def _first_view(task: Task, kind: StateType) -> int:
-    """Return the first view of a kind of state, counted from that of the task."""
-    skipped = task.graph.num_decision_states if kind == StateType.END and _is_by_node(task, kind) else 0
-    return (task.observations.ids(kind)[0] - skipped) * _num_views(task)
-
-
-def _num_ids(task: Task, kind: StateType) -> int:
-    return 1 if task.observations.is_unique(kind) else _length(task, kind)
 
 
 def _length(task: Task, kind: StateType) -> int:

@@ -98,7 +98,13 @@ class Rows(TakesNumbers, nn.Module):
         self.register_buffer("seed", torch.tensor([seed], device=device, dtype=torch.int64))
         self.register_buffer("row", torch.arange(first_row, first_row + self.num_rows, device=device))
         self._choose_engine()
-        self._make_images(noise_bank, device)
+        bank = shared_bank(self.pool, self.num_rows, noise_bank)
+        no_images = bank.images.new_empty(0, *bank.shape)
+        self._bank = bank._replace(images=no_images, noises=no_images)
+        self.image_shape = bank.shape
+        self.white = max(int(white_level(task.images)) for task in self.pool)
+        self.register_buffer("bank", bank.images.to(device), persistent=False)
+        self.register_buffer("noises", bank.noises.to(device), persistent=False)
         self.register_buffer("normal_table", philox.normal_table().to(device), persistent=False)
         zeros = torch.zeros(self.num_rows, dtype=torch.int64, device=device)
         for field, dtype in dynamics.STATE_DTYPES.items():
@@ -108,15 +114,6 @@ class Rows(TakesNumbers, nn.Module):
         self.tensors = TensorEngine()
         self.native = Native()
         self.set_tasks(tasks)
-
-    def _make_images(self, noise_bank: int, device: torch.device | None) -> None:
-        bank = shared_bank(self.pool, self.num_rows, noise_bank)
-        no_images = bank.images.new_empty(0, *bank.shape)
-        self._bank = bank._replace(images=no_images, noises=no_images)
-        self.image_shape = bank.shape
-        self.white = max(int(white_level(task.images)) for task in self.pool)
-        self.register_buffer("bank", bank.images.to(device), persistent=False)
-        self.register_buffer("noises", bank.noises.to(device), persistent=False)
 
     @property
     def device(self) -> torch.device:
