@@ -17,7 +17,7 @@ import yaml
 from baselines.parts.policy_gradient import PolicyGradient
 from baselines.update.captured import CapturedGroup
 from benchmarks.environment_ladder import WAYS, Rung, TimedRun
-from ctgraph_rl.batch.specs import specs_of
+from ctgraph_rl.batch.specs import make_specs
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.collect import collect
 from ctgraph_rl.packages import class_named, conf_dir
@@ -78,7 +78,7 @@ def built(name: str, task: Task, **changes: Any) -> PolicyGradient:
     values = {**settings(name), **changes}
     module, _, of_class = values.pop("_target_").rpartition(".")
     kind: Any = class_named(module, of_class)
-    return kind(*specs_of([task]), **values)
+    return kind(*make_specs([task]), **values)
 
 
 def learning(

@@ -337,7 +337,7 @@ def own_curricula(config_dir: Path) -> list[Curriculum]:
     return [curriculum_of(name, config_dir) for name in curriculum_names(config_dir)]
 
 
-def chosen(name: str, config_dir: Path | None) -> Curriculum:
+def find_curriculum(name: str, config_dir: Path | None) -> Curriculum:
     """Return the curriculum of a name or of a JSON file.
 
     Raises:

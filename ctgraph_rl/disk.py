@@ -109,7 +109,7 @@ def sync_folders(folder: Path) -> None:
         sync_folder(each)
 
 
-def made_folder(folder: Path) -> Path:
+def make_folder(folder: Path) -> Path:
     """Make a folder that the package names itself, unless it is there.
 
     Raises:
@@ -144,7 +144,7 @@ def new_folder(path: Path) -> Iterator[Path]:
         OSError: if it cannot be written; nothing is left.
     """
     require_new(path)
-    made_folder(path.absolute().parent)
+    make_folder(path.absolute().parent)
     part = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=PART, dir=path.absolute().parent))
     try:
         yield part

@@ -11,10 +11,10 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from typing_extensions import override
 
-from ctgraph_rl.batch.assignment import checked_num_ids, one_hot_ids
+from ctgraph_rl.batch.assignment import one_hot_ids, require_num_ids
 from ctgraph_rl.batch.native import Stepped
 from ctgraph_rl.batch.rows import Rows
-from ctgraph_rl.batch.specs import done_spec, reward_spec, specs_of
+from ctgraph_rl.batch.specs import done_spec, make_specs, reward_spec
 from ctgraph_rl.checks import require, require_all, takes_numbers, true_or_false
 from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.device import checked_device
@@ -101,7 +101,7 @@ class CTGraphEnv(EnvBase):
     ) -> None:
         require(*true_or_false(check_actions=check_actions, info=info))
         tasks = require_all(Task, "tasks", tasks)
-        self.num_task_ids = checked_num_ids(task_ids, num_task_ids)
+        self.num_task_ids = require_num_ids(task_ids, num_task_ids)
         device = None if device is None else checked_device(device)
         super().__init__(device=device, batch_size=torch.Size([len(tasks)]))
         self.check_actions = check_actions
@@ -115,7 +115,7 @@ class CTGraphEnv(EnvBase):
         self._task_id: tuple[Tensor | None, Tensor] = None, numbers
         self._steps: list[TensorDictBase] | None = None
         self._running: RowData = {}
-        specs = specs_of(self.rows.pool, self.batch_size, self.num_task_ids, self.info)
+        specs = make_specs(self.rows.pool, self.batch_size, self.num_task_ids, self.info)
         self.observation_spec = specs.observation.to(self.device)
         self.action_spec = specs.action.to(self.device)
         self.reward_spec = reward_spec(self.batch_size).to(self.device)
@@ -199,7 +199,7 @@ class CTGraphEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = None if mask is None else mask.view(-1)
         if set_state:
-            self.rows.state = self._given_state(tensordict, mask)
+            self.rows.state = self._read_state(tensordict, mask)
             shown = self.rows.show()
         else:
             shown = self.rows.reset(mask)
@@ -207,7 +207,7 @@ class CTGraphEnv(EnvBase):
         is_init = is_init if mask is None else is_init & mask
         return self._tensordict(self._data(shown.observation, shown.done.unsqueeze(-1), is_init.unsqueeze(-1), shown))
 
-    def _given_state(self, tensordict: TensorDictBase | None, mask: Tensor | None) -> RowState:
+    def _read_state(self, tensordict: TensorDictBase | None, mask: Tensor | None) -> RowState:
         """The state to go back to in the rows of a mask; refuses what no state of the rows' trees can be."""
         given = TensorDict() if tensordict is None else tensordict.get("state", TensorDict())
         complete = set(RowState._fields) <= set(given.keys())
@@ -273,12 +273,12 @@ class CTGraphEnv(EnvBase):
         return data.refine_names(*stacked.names)
 
     def _rollout_nonstop(self, **kwargs: Any) -> list[TensorDictBase]:
-        return self._kept(super()._rollout_nonstop(**kwargs))
+        return self._keep_steps(super()._rollout_nonstop(**kwargs))
 
     def _rollout_stop_early(self, **kwargs: Any) -> list[TensorDictBase]:
-        return self._kept(super()._rollout_stop_early(**kwargs))
+        return self._keep_steps(super()._rollout_stop_early(**kwargs))
 
-    def _kept(self, steps: list[TensorDictBase]) -> list[TensorDictBase]:
+    def _keep_steps(self, steps: list[TensorDictBase]) -> list[TensorDictBase]:
         """What the stock `rollout` is to stack: nothing of a step where this class stacks the steps itself."""
         if self._steps is None:
             return steps
@@ -328,7 +328,7 @@ class CTGraphEnv(EnvBase):
         done = shown.done.unsqueeze(-1)
         rewards = shown.reward.unsqueeze(-1)
         after = {**self._data(shown.observation, done, self._running["done"], shown), "reward": rewards}
-        return after, self._restarted(shown.following, done, self._running)
+        return after, self._restart_data(shown.following, done, self._running)
 
     def restart_data(self, done: Tensor, observation: Tensor) -> RowData:
         """Start an episode in the rows that are done; return the data that the next step starts from by key.
@@ -337,7 +337,7 @@ class CTGraphEnv(EnvBase):
             done: bool [N, 1], after the last step.
             observation: uint8 [N, *shape], after the last step.
         """
-        return self._restarted(self.rows.restart(done.squeeze(-1), observation), done, self._not_done())
+        return self._restart_data(self.rows.restart(done.squeeze(-1), observation), done, self._not_done())
 
     def _data(self, observation: Tensor, done: Tensor, is_init: Tensor, shown: Shown | Stepped) -> RowData:
         """Return the rows' data by key, all but rewards; ``shown`` says where the rows that are done arrived."""
@@ -347,7 +347,7 @@ class CTGraphEnv(EnvBase):
             data |= {**ends, "truncated": torch.zeros_like(done)}
         return data | self._counts(shown if isinstance(shown, Stepped) else self.rows)
 
-    def _restarted(self, observation: Tensor, is_init: Tensor, running: RowData) -> RowData:
+    def _restart_data(self, observation: Tensor, is_init: Tensor, running: RowData) -> RowData:
         return {"observation": observation, "is_init": is_init, **running, **self._counts(self.rows)}
 
     def _not_done(self) -> RowData:
@@ -362,9 +362,9 @@ class CTGraphEnv(EnvBase):
     def _counts(self, counts: Rows | Stepped) -> RowData:
         keys = ("step_count", "episode_reward") if self.info else ()
         data = {key: getattr(counts, key).unsqueeze(-1) for key in keys}
-        return data | {"task_id": self._shown_ids()} if self.num_task_ids else data
+        return data | {"task_id": self._show_ids()} if self.num_task_ids else data
 
-    def _shown_ids(self) -> Tensor:
+    def _show_ids(self) -> Tensor:
         """Return the rows' task ids as one-hot, uint8 [N, num_task_ids]; zeros for tasks without one."""
         task, shown = self._task_id
         if task is not self.rows.task:

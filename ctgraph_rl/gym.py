@@ -19,9 +19,9 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ctgraph_rl.batch.assignment import numbers_in
+from ctgraph_rl.batch.assignment import find_numbers
 from ctgraph_rl.batch.rows import Rows, seed_rule
-from ctgraph_rl.batch.shown_ids import with_id, with_task_ids
+from ctgraph_rl.batch.shown_ids import add_task_ids, with_id
 from ctgraph_rl.checks import NamedValues, Rule, as_int, as_tuple, is_int, require, takes_numbers
 from ctgraph_rl.core.dynamics import NO_LEAF, OUTCOME_RUNNING, Shown, choose
 from ctgraph_rl.draw.pixels import render
@@ -87,7 +87,7 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
         self.task_pool = self.rows.pool
         self.render_mode = _known_mode(render_mode)
         images, self.action_space = _spaces(self.rows)
-        self.observation_space, self._ids = with_task_ids(images, self.task_pool, task_ids, num_task_ids)
+        self.observation_space, self._ids = add_task_ids(images, self.task_pool, task_ids, num_task_ids)
         self._number = self._next_number = self.task_pool.index(task)
         self._num_actions = self.rows.max_branching + 1
         self._is_seeded = False
@@ -95,7 +95,7 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
 
     def set_task(self, task: Task) -> None:
         """Change to another task of the pool at the next reset."""
-        (self._next_number,) = numbers_in(self.task_pool, [task])
+        (self._next_number,) = find_numbers(self.task_pool, [task])
 
     @torch.inference_mode()
     @takes_numbers
@@ -206,17 +206,17 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**_RENDERING, "autoreset_mode": self.autoreset_mode}
         images, self.single_action_space = _spaces(self.rows)
-        self.single_observation_space, self._ids = with_task_ids(images, self.task_pool, task_ids, num_task_ids)
+        self.single_observation_space, self._ids = add_task_ids(images, self.task_pool, task_ids, num_task_ids)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._numbers = self._next_numbers = np.array(numbers_in(self.task_pool, tasks))
+        self._numbers = self._next_numbers = np.array(find_numbers(self.task_pool, tasks))
         self._seeds = np.zeros(num_envs, np.int64)
         self._is_seeded = False
         self._is_over = np.ones(num_envs, np.bool_)
 
     def set_tasks(self, tasks: Iterable[Task]) -> None:
         """Give every row a task of the pool; a row changes to it at its next reset."""
-        numbers = np.array(numbers_in(self.task_pool, tasks))
+        numbers = np.array(find_numbers(self.task_pool, tasks))
         require((len(numbers) == self.num_envs, f"set_tasks needs {self.num_envs} tasks, got {len(numbers)}"))
         self._next_numbers = numbers
 
@@ -254,7 +254,7 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         Raises:
             ValueError: for other actions, before the first reset, and for rows that are done without autoreset.
         """
-        action = self._checked(actions)
+        action = self._check(actions)
         over = self._is_over
         if over.any() or self.rows.uses_kernel:
             self._change_tasks(over)
@@ -292,7 +292,7 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
             infos[f"_{key}"] = np.ones(self.num_envs, np.bool_) if mask is None else mask.copy()
         return infos
 
-    def _checked(self, actions: NDArray[np.int64]) -> Tensor:
+    def _check(self, actions: NDArray[np.int64]) -> Tensor:
         action = np.asarray(actions)
         last = self.rows.max_branching
         fits = action.shape == (self.num_envs,) and action.dtype.kind in "iu"

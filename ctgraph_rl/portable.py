@@ -76,7 +76,7 @@ def check_portable() -> None:
     Raises:
         ValueError: for a CPU that lacks instructions, and for variables that are not set; names them.
     """
-    lacking = _lacking()
+    lacking = _find_lacking()
     variables = " ".join(f"{name}={value}" for name, value in VARIABLES.items())
     require((not lacking, f"portable=true needs an x86-64 CPU with AVX2 and FMA, this one lacks {', '.join(lacking)}"))
     require((_has_variables(), f"portable=true needs these variables before torch is imported: {variables}; set them"))
@@ -89,7 +89,7 @@ def become_portable() -> None:
         Restart: which the command's entry point answers with `restart`.
         ValueError: for a CPU that lacks instructions.
     """
-    if not _has_variables() and not _lacking():
+    if not _has_variables() and not _find_lacking():
         raise Restart
     check_portable()
 
@@ -113,19 +113,19 @@ def restart(environment: Mapping[str, str], arguments: Sequence[str]) -> NoRetur
 
 def cpu_model() -> str | None:
     """Return the name of the CPU's model; None where the system does not say it."""
-    return _of_cpu("model name") or platform.processor() or None
+    return _read_cpu("model name") or platform.processor() or None
 
 
 def _has_variables() -> bool:
     return all(os.environ.get(name) == value for name, value in VARIABLES.items())
 
 
-def _lacking() -> list[str]:
-    there = _of_cpu("flags").split() if platform.machine() in ("x86_64", "AMD64") else []
+def _find_lacking() -> list[str]:
+    there = _read_cpu("flags").split() if platform.machine() in ("x86_64", "AMD64") else []
     return [name for name in NEEDED if name not in there]
 
 
-def _of_cpu(field: str) -> str:
+def _read_cpu(field: str) -> str:
     path = Path("/proc/cpuinfo")
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
     return next((line.partition(":")[2].strip() for line in lines if line.split(":")[0].strip() == field), "")

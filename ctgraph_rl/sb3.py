@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ctgraph_rl.batch.shown_ids import with_id, with_task_ids
+from ctgraph_rl.batch.shown_ids import add_task_ids, with_id
 from ctgraph_rl.checks import NamedValues, Rule, require, takes_numbers
 from ctgraph_rl.gym import CTGraphVectorEnv
 from ctgraph_rl.tasks.task import Task
@@ -52,7 +52,7 @@ class SB3VecEnv(VecEnv):
     ) -> None:
         self.envs = CTGraphVectorEnv(num_envs, task, autoreset_mode=AutoresetMode.SAME_STEP, **kwargs)
         alone = self.envs.single_observation_space
-        space, self._ids = with_task_ids(alone, self.envs.task_pool, task_ids, num_task_ids)
+        space, self._ids = add_task_ids(alone, self.envs.task_pool, task_ids, num_task_ids)
         super().__init__(num_envs, space, self.envs.single_action_space)
         self.metadata = self.envs.metadata
 

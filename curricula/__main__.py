@@ -28,7 +28,7 @@ def _compute(arguments: argparse.Namespace) -> None:
     if arguments.command == "probabilities":
         show([describe.probabilities()], arguments.format)
     elif arguments.command == "describe":
-        curriculum = describe.chosen(arguments.name, arguments.config_dir)
+        curriculum = describe.find_curriculum(arguments.name, arguments.config_dir)
         show(describe.describe(curriculum, arguments.frames_per_second), arguments.format)
         describe.write(curriculum, arguments.figure, arguments.similarity, arguments.json)
     else:

@@ -9,7 +9,7 @@ from helpers.oracles import confounding, fully_observable, one_hot, surjective
 from rich.console import Console
 
 import curricula
-from ctgraph_rl.batch.params import shared_bank
+from ctgraph_rl.batch.params import make_shared_bank
 from ctgraph_rl.describe import (
     describe,
     evaluation_in_words,
@@ -47,7 +47,7 @@ def test_more_frames_than_a_float_holds_are_shown_as_infinite():
 def test_memory_is_what_the_environment_holds(tasks):
     bank, per_row = memory(make(*(Block(task, 1) for task in tasks)))
 
-    held = shared_bank(tasks, 1, 0)
+    held = make_shared_bank(tasks, 1, 0)
     assert bank == held.images.numel()
     assert per_row == 2 * math.prod(held.shape)
 

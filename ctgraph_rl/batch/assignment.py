@@ -16,7 +16,7 @@ from ctgraph_rl.tasks.switch import Switch
 from ctgraph_rl.tasks.task import Task
 
 
-def checked_num_ids(task_ids: Mapping[Any, int] | None, num_task_ids: int | None) -> int:
+def require_num_ids(task_ids: Mapping[Any, int] | None, num_task_ids: int | None) -> int:
     """Return the length of ``task_id``, 0 for none; see `ctgraph_rl.CTGraphEnv` for the arguments and errors."""
     if task_ids is None:
         require((num_task_ids is None, f"num_task_ids={num_task_ids!r} needs task_ids"))
@@ -36,7 +36,7 @@ def one_hot_ids(ids: Tensor, length: int) -> Tensor:
     return (ids.unsqueeze(-1) == torch.arange(length, device=ids.device)).to(torch.uint8)
 
 
-def numbers_in(pool: Iterable[Task], tasks: Iterable[Task]) -> list[int]:
+def find_numbers(pool: Iterable[Task], tasks: Iterable[Task]) -> list[int]:
     """Return the numbers of tasks in a pool.
 
     Raises:
@@ -49,7 +49,7 @@ def numbers_in(pool: Iterable[Task], tasks: Iterable[Task]) -> list[int]:
     return [number[task] for task in tasks]
 
 
-def goal_leaves(tasks: Sequence[Task], goals: Iterable[Sequence[int]]) -> list[int]:
+def find_leaves(tasks: Sequence[Task], goals: Iterable[Sequence[int]]) -> list[int]:
     """Return the numbers of the end states that goals, given by their decisions, are in tasks.
 
     Raises:

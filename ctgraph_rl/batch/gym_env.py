@@ -15,7 +15,7 @@ from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 from typing_extensions import override
 
-from ctgraph_rl.batch.assignment import checked_num_ids, one_hot_ids
+from ctgraph_rl.batch.assignment import one_hot_ids, require_num_ids
 from ctgraph_rl.batch.rows import seed_rule
 from ctgraph_rl.batch.specs import done_spec, observation_spec, reward_spec
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule, require, require_all, takes_numbers
@@ -76,7 +76,7 @@ class GymEnv(EnvBase):
         require(
             seed_rule(seed), _same_spaces(self.pool), *(_repeats_rule(task, registered(task)) for task in self.pool)
         )
-        self.num_task_ids = checked_num_ids(task_ids, num_task_ids)
+        self.num_task_ids = require_num_ids(task_ids, num_task_ids)
         count = len(tasks)
         super().__init__(device=checked_device(device), batch_size=torch.Size([count]))
         self.seed = seed

@@ -192,7 +192,7 @@ class Native:
             self._call = self._prepare()  # the first call, or tables that were moved, as into memory of many processes
         call = self._call
         n = call.num_rows
-        before = self._own(state, call)
+        before = self._own_state(state, call)
         after = RowState(*map(torch.empty_like, before))
         call.before = _StatePointers(*_pointers(before))
         call.after = _StatePointers(*_pointers(after))
@@ -214,7 +214,7 @@ class Native:
             self._state = after
         return after, wrong
 
-    def _own(self, state: RowState, call: _Call) -> RowState:
+    def _own_state(self, state: RowState, call: _Call) -> RowState:
         """States that the kernel can read: its own are, others are checked."""
         last = self._state
         if last is not None and all(a is b for a, b in zip(state, last, strict=True)):
@@ -237,7 +237,7 @@ class Native:
         streams = len(params.seed) in (1, n) and params.row.shape == (n,)
         require((streams, f"rows need a seed and a number each, got {len(params.seed)} and {len(params.row)} for {n}"))
         tables = {
-            "tasks": _packed(self.tables),
+            "tasks": _pack(self.tables),
             "task": self.tables.entry,
             "seed": params.seed,
             "row": params.row,
@@ -286,7 +286,7 @@ def _set(call: _Call, name: str, array: Tensor | None, num_steps: int) -> Tensor
     return array
 
 
-def _packed(tables: Tables) -> Tensor:
+def _pack(tables: Tables) -> Tensor:
     """Return the different tasks as int64 [U, fields], in the order of ``Task`` in `kernel.c`; floats by their bits."""
     tree = tables.tree
     x = tables.x

@@ -77,9 +77,9 @@ class Tables(NamedTuple):
         """The goal of each row's task, int64 [N]."""
         return self.goal_leaf.index_select(0, self.entry)
 
-    def of_rows(self) -> tuple[TreeParams, ObservationParams, RewardParams]:
+    def by_row(self) -> tuple[TreeParams, ObservationParams, RewardParams]:
         """Return the parameters of each row."""
-        return _of_rows(self.tree, self.entry), _of_rows(self.x, self.entry), _of_rows(self.g, self.entry)
+        return _select_rows(self.tree, self.entry), _select_rows(self.x, self.entry), _select_rows(self.g, self.entry)
 
 
 def make_tables(tasks: tuple[Task, ...], number: Tensor, bank: Bank) -> Tables:
@@ -247,7 +247,7 @@ def observation_shape(pool: Sequence[Task], num_rows: int) -> tuple[int, ...]:
     return max(shapes)
 
 
-def shared_bank(pool: tuple[Task, ...], num_rows: int, num_noises: int) -> Bank:
+def make_shared_bank(pool: tuple[Task, ...], num_rows: int, num_noises: int) -> Bank:
     """Return the bank of a pool, with so many noises for each level drawn in advance.
 
     Raises:
@@ -276,12 +276,12 @@ def shared_bank(pool: tuple[Task, ...], num_rows: int, num_noises: int) -> Bank:
     )
 
 
-def _of_rows(part: Any, index: Tensor) -> Any:
+def _select_rows(part: Any, index: Tensor) -> Any:
     """Return parameters of rows from those of their tasks; what is a table of all tasks stays one."""
     rows = {}
     for name, value in part._asdict().items():
         if isinstance(value, (LegacyIndex, Swap)):
-            rows[name] = _of_rows(value, index)
+            rows[name] = _select_rows(value, index)
         elif isinstance(value, Tensor) and name not in _TABLES[type(part)]:
             rows[name] = value.index_select(0, index)
     return part._replace(**rows)

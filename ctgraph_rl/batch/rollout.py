@@ -102,7 +102,7 @@ def _native(rows: Rows, policy: TensorPolicy | Tensor, steps: Steps) -> RowState
         steps.action.copy_(policy)
         return _fill(rows, state, steps, slice(None))
     for t in range(len(steps.action)):
-        steps.action[t] = _chosen(rows, policy, steps, t, start)
+        steps.action[t] = _choose_actions(rows, policy, steps, t, start)
         state = _fill(rows, state, steps, slice(t, t + 1))
     return state
 
@@ -126,7 +126,7 @@ def _tensors(rows: Rows, policy: TensorPolicy | Tensor, steps: Steps) -> RowStat
     torch.eq(state.step_count, 0, out=steps.is_init[0])
     plain = not (uses.pixel_noise or uses.reward_cue or params.x.taps)
     for t in range(len(steps.action)):
-        action = policy[t] if isinstance(policy, Tensor) else _chosen(rows, policy, steps, t, start)
+        action = policy[t] if isinstance(policy, Tensor) else _choose_actions(rows, policy, steps, t, start)
         state = dynamics.advance(state, action, words, params, uses, absorbing=False)
         done = is_done(state, params.tree)
         steps.action[t] = action
@@ -144,7 +144,7 @@ def _tensors(rows: Rows, policy: TensorPolicy | Tensor, steps: Steps) -> RowStat
     return state
 
 
-def _chosen(rows: Rows, policy: TensorPolicy, steps: Steps, t: int, start: RowState) -> Tensor:
+def _choose_actions(rows: Rows, policy: TensorPolicy, steps: Steps, t: int, start: RowState) -> Tensor:
     params = rows.params
     action = policy(steps.observation[t], steps.is_init[t])
     same = rows.params is params and all(map(operator.is_, rows.state, start))

@@ -8,9 +8,9 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, nn
 
-from ctgraph_rl.batch.assignment import Assignment, goal_leaves, numbers_in
+from ctgraph_rl.batch.assignment import Assignment, find_leaves, find_numbers
 from ctgraph_rl.batch.native import Native, kernel_rule, knows, require_kernel
-from ctgraph_rl.batch.params import make_tables, shared_bank
+from ctgraph_rl.batch.params import make_shared_bank, make_tables
 from ctgraph_rl.batch.tensor_engine import TensorEngine
 from ctgraph_rl.checks import Rule, TakesNumbers, is_int, plain, require, require_all, takes_numbers
 from ctgraph_rl.core import dynamics, philox
@@ -98,7 +98,7 @@ class Rows(TakesNumbers, nn.Module):
         self.register_buffer("seed", torch.tensor([seed], device=device, dtype=torch.int64))
         self.register_buffer("row", torch.arange(first_row, first_row + self.num_rows, device=device))
         self._choose_engine()
-        bank = shared_bank(self.pool, self.num_rows, noise_bank)
+        bank = make_shared_bank(self.pool, self.num_rows, noise_bank)
         no_images = bank.images.new_empty(0, *bank.shape)
         self._bank = bank._replace(images=no_images, noises=no_images)
         self.image_shape = bank.shape
@@ -177,7 +177,7 @@ class Rows(TakesNumbers, nn.Module):
         n = self.num_rows
         require((len(tasks) == n, f"set_tasks needs one task per row, {n} in all, got {len(tasks)}"))
         whole_pool = torch.arange(len(self.pool), device=self.device)
-        numbers = torch.tensor(numbers_in(self.pool, tasks), device=self.device, dtype=torch.int64)
+        numbers = torch.tensor(find_numbers(self.pool, tasks), device=self.device, dtype=torch.int64)
         self._choose(whole_pool, numbers, None, at_episode_end)
 
     def switch_tasks(self, tasks: Iterable[Task], switch: Switch, at_episode_end: bool = False) -> None:
@@ -191,7 +191,7 @@ class Rows(TakesNumbers, nn.Module):
         Raises:
             ValueError: for less than two tasks, one that is not in the pool, and what is no switch.
         """
-        choices = torch.tensor(numbers_in(self.pool, tasks), device=self.device, dtype=torch.int64)
+        choices = torch.tensor(find_numbers(self.pool, tasks), device=self.device, dtype=torch.int64)
         enough = len(choices) > 1, "switch_tasks needs at least two tasks, got one; use set_tasks"
         require(enough, switch_rule(switch))
         self._choose(choices, torch.zeros_like(self.row), switch, at_episode_end)
@@ -220,7 +220,7 @@ class Rows(TakesNumbers, nn.Module):
     def _take_params(self) -> None:
         self.tables = self.tables.assigned(self.task)
         images = (self.bank, self.noises, self.normal_table)
-        self._bind(RowParams(self.seed, self.row, *self.tables.of_rows(), *images))
+        self._bind(RowParams(self.seed, self.row, *self.tables.by_row(), *images))
 
     def _bind(self, params: RowParams) -> None:
         self.params = params
@@ -255,7 +255,7 @@ class Rows(TakesNumbers, nn.Module):
             ValueError: if a goal is not one of its row's tree.
         """
         if not isinstance(goals, Tensor) or goals.ndim == 2:
-            goals = torch.tensor(goal_leaves(self.tasks, plain(goals)), device=self.device, dtype=torch.int64)
+            goals = torch.tensor(find_leaves(self.tasks, plain(goals)), device=self.device, dtype=torch.int64)
         fits = goals.shape == (self.num_rows,) and goals.dtype == torch.int64
         require((fits, f"goals must be int64 of shape [{self.num_rows}], got {goals.dtype} {list(goals.shape)}"))
         outside = (goals < 0) | (goals >= self.params.g.num_leaves)

@@ -9,12 +9,12 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ctgraph_rl.batch.assignment import checked_num_ids
+from ctgraph_rl.batch.assignment import require_num_ids
 from ctgraph_rl.checks import require
 from ctgraph_rl.tasks.task import Task
 
 
-def with_task_ids(
+def add_task_ids(
     space: spaces.Space[Any], pool: Sequence[Task], task_ids: Mapping[Task, int] | None, num_task_ids: int | None
 ) -> tuple[spaces.Space[Any], NDArray[np.uint8] | None]:
     """Return the space of observations with ids of tasks, and the id of each task of a pool as one-hot.
@@ -28,7 +28,7 @@ def with_task_ids(
     Raises:
         ValueError: for a task without an id, and ids that do not fit the length.
     """
-    length = checked_num_ids(task_ids, num_task_ids)
+    length = require_num_ids(task_ids, num_task_ids)
     if task_ids is None:
         return space, None
     without = [each for each in pool if each not in task_ids]

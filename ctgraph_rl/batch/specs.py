@@ -22,7 +22,9 @@ class Specs(NamedTuple):
     action: Categorical
 
 
-def specs_of(pool: Sequence[Task], batch_size: tuple[int, ...] = (), num_task_ids: int = 0, info: bool = True) -> Specs:
+def make_specs(
+    pool: Sequence[Task], batch_size: tuple[int, ...] = (), num_task_ids: int = 0, info: bool = True
+) -> Specs:
     """Return the specs of an environment for a pool of tasks, on the CPU, without building one.
 
     Args:
@@ -50,7 +52,7 @@ def observation_spec(
 
     Args:
         observation: the spec of their observations.
-        batch_size: see `specs_of`, as for ``num_task_ids``.
+        batch_size: see `make_specs`, as for ``num_task_ids``.
         num_task_ids: length of ``task_id``.
         info: whether ``step_count`` and ``episode_reward`` are there.
         ends: whether ``outcome`` and ``leaf`` are there.

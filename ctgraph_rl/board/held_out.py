@@ -16,7 +16,7 @@ from ctgraph_rl.board.rerun import Rerun, RerunCell, check_of_scores, job_of, sc
 from ctgraph_rl.board.rescore import Check, of_the_protocol
 from ctgraph_rl.board.submission import Submission
 from ctgraph_rl.board.tracks import HELD_OUT_SEEDS, drawn, held_out_seeds
-from ctgraph_rl.disk import made_folder, write_whole
+from ctgraph_rl.disk import make_folder, write_whole
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CURRICULUM
 from ctgraph_rl.log.run_log import RunLog
@@ -44,7 +44,7 @@ def held_out_cells(submission: Submission, number: int, count: int, folder: Path
     cells = []
     first = submission.finished[0]
     for seed in seeds_of(submission, number, count):
-        own = made_folder(folder / f"seed{seed}").resolve()
+        own = make_folder(folder / f"seed{seed}").resolve()
         curriculum = other_curriculum(submission.curriculum, f"{submission.digest} {number} {seed}")
         write_whole(own / CURRICULUM, file_text(curriculum.to_json()))
         job = job_of(submission, (seed,), first, own / CURRICULUM)

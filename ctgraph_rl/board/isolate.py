@@ -28,7 +28,7 @@ from tempfile import TemporaryFile
 from typing import NamedTuple
 
 from ctgraph_rl.checks import positive, require
-from ctgraph_rl.disk import made_folder
+from ctgraph_rl.disk import make_folder
 
 OLDEST = (0, 8)
 """The first version of bubblewrap that has all options."""
@@ -225,7 +225,7 @@ def run_isolated(
     )
     folder = folder.resolve()
     for name in OWN.values():
-        made_folder(folder / name)
+        make_folder(folder / name)
     own = {"HOME": str(folder), "TMPDIR": str(folder / "tmp"), **(variables or {})}
     groups = new_cgroups(limits.memory) if isolated.memory == CGROUP else []
     try:

@@ -24,7 +24,7 @@ from ctgraph_rl.board.rescore import NO_ROW, Check, differing, equal
 from ctgraph_rl.board.submission import Submission, SubmittedRun, counted, experts_of, log_sum
 from ctgraph_rl.board.two_samples import compare_samples
 from ctgraph_rl.checks import ReadOnlyValues, are_ints, require
-from ctgraph_rl.disk import made_folder, read_text, require_no_link, write_whole
+from ctgraph_rl.disk import make_folder, read_text, require_no_link, write_whole
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CURRICULUM, FAILURE, LOG, METRICS, MOST_BYTES_OF_A_REASON
 from ctgraph_rl.log.provenance import machine, numbers_of, versions
@@ -150,7 +150,7 @@ def learn_again(cell: RerunCell, limits: Limits, isolated: Isolation, code: Sequ
 
     Modules of others are looked for in ``code``.
     """
-    made_folder(cell.folder)
+    make_folder(cell.folder)
     if cell.is_finished:
         return Outcome(0, None, "")
     if cell.job.entry_point is not None:

@@ -28,7 +28,7 @@ from ctgraph_rl.board.submission import (
 )
 from ctgraph_rl.board.tracks import Track, track
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule, repeated, require
-from ctgraph_rl.disk import made_folder, new_folder, require_new, write_whole
+from ctgraph_rl.disk import make_folder, new_folder, require_new, write_whole
 from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.escape import listed, terminal_text
 from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG, locked_new
@@ -80,9 +80,9 @@ def submit(
     about["track"] = None
     if of_track is not None:
         about |= {"track": of_track.name, "track_version": of_track.version}
-    made_folder(to.absolute().parent)
+    make_folder(to.absolute().parent)
     with locked_new(to), new_folder(to) as folder:
-        made_folder(folder / LOGS)
+        make_folder(folder / LOGS)
         for run, line in zip(runs, lines, strict=True):
             write_whole(folder / log_name(line.run), packed((run.path / LOG).read_bytes()))
             for number, path in experts.get(run.seed, {}).items():

@@ -30,7 +30,7 @@ from ctgraph_rl.board.rescore import RESCORED, Check, rescore
 from ctgraph_rl.board.submission import MOST_RUNS, VERIFICATION, Submission, read_submission
 from ctgraph_rl.board.two_samples import runs_needed
 from ctgraph_rl.checks import NamedValues, Rule, is_int, is_real, require
-from ctgraph_rl.disk import made_folder, write_whole
+from ctgraph_rl.disk import make_folder, write_whole
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
 from ctgraph_rl.log.files import locked
 from ctgraph_rl.log.provenance import machine, versions
@@ -86,7 +86,7 @@ def planned(submission: Submission, arguments: argparse.Namespace) -> Plan:
     finished = len(submission.finished)
     require((finished > 0, f"{submission.path} has no finished run: there is nothing to run again"))
     number = secrets.randbelow(10**9) if arguments.number is None else arguments.number
-    folder = made_folder(arguments.folder / f"{submission.digest[:12]}-{number}")
+    folder = make_folder(arguments.folder / f"{submission.digest[:12]}-{number}")
     folder.chmod(0o700)  # others' code may make a program there that runs as you, for other users of this machine
     count = arguments.cells
     enough = max(count, runs_needed(finished))

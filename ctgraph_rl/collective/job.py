@@ -15,7 +15,7 @@ from rich.console import Console
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.collective.summary import COLLECTIVE, FILES, describe_collective, read_collective, write_summary
-from ctgraph_rl.disk import made_folder
+from ctgraph_rl.disk import make_folder
 from ctgraph_rl.learn.collective import ExchangeLike, learn_collective
 from ctgraph_rl.learn.progress import ProgressBar
 from ctgraph_rl.log.escape import terminal_text
@@ -86,7 +86,7 @@ def _learn(session: Session, cfg: Any, cells: Sequence[ConfigAndPath], exchange:
         if _is_replaced(cfg, cells):
             checkpoints.clear()
         for member in members:
-            session.lock(made_folder(member.run_dir))
+            session.lock(make_folder(member.run_dir))
         for (each, _), member in zip(cells, members, strict=True):
             prepare(session, each, member)
             if each.experts:

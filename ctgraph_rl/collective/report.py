@@ -11,7 +11,7 @@ import numpy as np
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.collective.summary import COLLECTIVE, RUN, WHAT, Collective, read_collective, tables
-from ctgraph_rl.disk import made_folder, write_whole
+from ctgraph_rl.disk import make_folder, write_whole
 from ctgraph_rl.log.escape import csv_text, markdown_table, markdown_text
 from ctgraph_rl.log.files import METRICS, locked
 from ctgraph_rl.metrics.record import MASTERED
@@ -82,7 +82,7 @@ def write_report(paths: Sequence[Path | str], folder: Path) -> Path:
     """
     require_packages()
     found = find_collectives(paths)
-    with locked(made_folder(folder)):
+    with locked(make_folder(folder)):
         gallery = Gallery(folder)
         for name, rows in tables(found).items():
             write_whole(folder / name, csv_text(rows))

@@ -71,11 +71,11 @@ def goals_by_graph(curriculum: Curriculum) -> dict[CTGraph, dict[Goal, str]]:
     labels: dict[CTGraph, dict[Goal, str]] = {}
     for graph, goals in blocks.items():
         for goal, of_goal in goals.items():
-            labels.setdefault(graph, {})[goal] = f"{in_digits(goal)}\n{_blocks_in_words(sorted(set(of_goal)))}"
+            labels.setdefault(graph, {})[goal] = f"{in_digits(goal)}\n{_write_blocks(sorted(set(of_goal)))}"
     return labels
 
 
-def _blocks_in_words(numbers: Sequence[int]) -> str:
+def _write_blocks(numbers: Sequence[int]) -> str:
     if len(numbers) == 1:
         return f"block {numbers[0]}"
     return f"blocks {', '.join(map(str, numbers))}" if len(numbers) <= 3 else f"{len(numbers)} blocks"

@@ -59,9 +59,9 @@ def _name(state: Key) -> str:
 
 
 def _attributes(what: str, **values: str) -> str:
-    return f"{what} [{', '.join(f'{key}={_quoted(value)}' for key, value in values.items())}]"
+    return f"{what} [{', '.join(f'{key}={_quote(value)}' for key, value in values.items())}]"
 
 
-def _quoted(text: str) -> str:
+def _quote(text: str) -> str:
     escaped = terminal_lines(text).replace("\\", "\\\\").replace('"', '\\"')
     return '"' + escaped.replace("\n", "\\n") + '"'

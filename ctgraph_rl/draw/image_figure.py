@@ -44,7 +44,7 @@ def image_figure(task: Task, seed: int = 0) -> Any:
     """
     x = task.observations
     varies = x.read_noise or x.read_rotation or task.images.num_variants > 1
-    lines = _varied(task, seed) if varies else _plain(task)
+    lines = _make_varied_lines(task, seed) if varies else _make_plain_lines(task)
     figure = new_figure(INCHES * COLUMNS + 1.0, INCHES * ROW * len(lines) + 0.5)
     axes = figure.subplots()
     for row, line in enumerate(lines):
@@ -56,7 +56,7 @@ def image_figure(task: Task, seed: int = 0) -> Any:
     return figure
 
 
-def _plain(task: Task) -> list[ImageLine]:
+def _make_plain_lines(task: Task) -> list[ImageLine]:
     lines = []
     for kind in StateType:
         ids = _first_ids(task, kind, COLUMNS)
@@ -64,7 +64,7 @@ def _plain(task: Task) -> list[ImageLine]:
     return lines
 
 
-def _varied(task: Task, seed: int) -> list[ImageLine]:
+def _make_varied_lines(task: Task, seed: int) -> list[ImageLine]:
     """A line for each of the first ids of each kind of state."""
     shown: list[tuple[StateType, int]] = []
     for kind in StateType:
@@ -92,7 +92,7 @@ def _reads(task: Task, shown: list[tuple[StateType, int]], count: int, seed: int
     rows: list[Task] = []
     kinds: list[int] = []
     for kind, number in shown:
-        rows += [_pinned(task, kind, number)] * count
+        rows += [_pin(task, kind, number)] * count
         kinds += [kind] * count
     batch = Rows(rows, seed)
     batch.reset()
@@ -103,7 +103,7 @@ def _reads(task: Task, shown: list[tuple[StateType, int]], count: int, seed: int
     return batch.show().observation.unflatten(0, (len(shown), count))
 
 
-def _pinned(task: Task, kind: StateType, number: int) -> Task:
+def _pin(task: Task, kind: StateType, number: int) -> Task:
     name = kind.name.lower()
     changes: dict[str, Any] = {f"{name}_ids": (number, number)}
     if task.observations.is_unique(kind):

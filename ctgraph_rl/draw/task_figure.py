@@ -208,9 +208,9 @@ class _TaskPicture:
             return ""
         parts = []
         if state in self.policy:
-            parts.append(f"{sum(_of(self.policy[state], actions)):.2f}")
+            parts.append(f"{sum(_pick(self.policy[state], actions)):.2f}")
         if state in self.values:
-            parts.append(f"Q {max(_of(self.values[state], actions)):.2f}")
+            parts.append(f"Q {max(_pick(self.values[state], actions)):.2f}")
         return "\n".join(parts)
 
     def _draw_states(self) -> None:
@@ -260,7 +260,7 @@ class _TaskPicture:
         for (kind, node), place in self.places.items():
             if kind in (WAIT, DECISION):
                 wrong = self._wrong((kind, node))
-                arrow = base | {"linewidth": 0.8 + 2 * sum(_of(self.policy.get((kind, node), ()), wrong))}
+                arrow = base | {"linewidth": 0.8 + 2 * sum(_pick(self.policy.get((kind, node), ()), wrong))}
                 self._note("", place, (1.1 * self.size, 0), arrowprops=arrow, zorder=2)
                 numbers = self._numbers((kind, node), wrong)
                 side = -1 if kind == WAIT else 1  # away from branches
@@ -321,7 +321,7 @@ def _probabilities(choice: Any, branching_factor: int) -> list[float]:
     return [float(chance) for chance in choice]
 
 
-def _of(numbers: Sequence[float], actions: Sequence[int]) -> list[float]:
+def _pick(numbers: Sequence[float], actions: Sequence[int]) -> list[float]:
     return [numbers[action] for action in actions if action < len(numbers)]
 
 

@@ -33,17 +33,17 @@ def as_text(tasks: Sequence[Task], state: RowState, observation: Tensor, white: 
 def _place(task: Task, kind: int, node: int, goal_leaf: int, step_count: int) -> str:
     """Return where a row is, by branches: ``wait state after 1 2, step 4, goal 1 1``; and what is swapped."""
     graph = task.graph
-    goal = _spaced(graph.path(graph.num_decision_states + goal_leaf))
-    way = f" after {_spaced(graph.path(node))}" if node else ""
+    goal = _write_path(graph.path(graph.num_decision_states + goal_leaf))
+    way = f" after {_write_path(graph.path(node))}" if node else ""
     text = f"{StateType(kind).name.lower()} state{way}, step {step_count}, goal {goal}"
     if task.swapped_branches is None:
         return text
     path, (first, second) = task.swapped_branches
-    at = f"after {_spaced(path)}" if path else "at the first decision"
+    at = f"after {_write_path(path)}" if path else "at the first decision"
     return f"{text}, {first} and {second} swapped {at}"
 
 
-def _spaced(path: Sequence[int]) -> str:
+def _write_path(path: Sequence[int]) -> str:
     return " ".join(map(str, path))
 
 

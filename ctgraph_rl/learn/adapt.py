@@ -14,7 +14,7 @@ from torch import nn
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.learn.collect import Policy
-from ctgraph_rl.learn.logits_policy import as_policy, positional
+from ctgraph_rl.learn.logits_policy import as_policy, positional_parameters
 
 
 def adapt(policy: Any, greedy: bool, num_actions: int | None, shows_ids: bool = False) -> Policy:
@@ -36,7 +36,7 @@ def adapt(policy: Any, greedy: bool, num_actions: int | None, shows_ids: bool = 
     if isinstance(policy, nn.Module):
         return as_policy(policy, num_actions)
     require((callable(policy), f"policy must be a function, or an object with predict, got {type(policy).__name__}"))
-    places = positional(policy)
+    places = positional_parameters(policy)
     if [p.name for p in places[1:2]] == ["task_id"]:
         return act(lambda shown, state, start: (policy(*_parts(shown)), None))
     taken = [p for p in places if p.default is p.empty]

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from ctgraph_rl.batch.specs import Specs, specs_of
+from ctgraph_rl.batch.specs import Specs, make_specs
 from ctgraph_rl.checks import Rule, at_least_one, is_int, require, takes_numbers
 from ctgraph_rl.core.dynamics import RowState, beside
 from ctgraph_rl.core.region import Region, captures
@@ -92,7 +92,7 @@ def agent_specs(curriculum: Curriculum) -> Specs:
     """
     pool, length = _pool_and_ids(curriculum)
     if are_graphs(pool):
-        return specs_of(pool, num_task_ids=length)
+        return make_specs(pool, num_task_ids=length)
     env = make_env(curriculum, pool[:1], 0)
     try:
         return Specs(env.observation_spec_unbatched, env.action_spec_unbatched)
@@ -154,7 +154,7 @@ def batches(
 
     With ``carried`` and ``done`` it resumes after ``done`` frames.
     """
-    start = start_of_episodes(env, initial_state)
+    start = make_start(env, initial_state)
     data = dict((env.reset().update(start) if carried is None else carried).items(True, True))
     act_once = CapturedAct(env, policy, start) if _is_captured(env, policy) else partial(act, env, policy, start=start)
     unstored = [key for key in start if key.startswith(UNSTORED)]
@@ -167,10 +167,10 @@ def batches(
                     between_steps(frames)
                 step, data = act_once(data)
                 _append(steps, step, unstored)
-        yield in_time_order(steps, env), TensorDict(data, env.batch_size, device=env.device)
+        yield stack_steps(steps, env), TensorDict(data, env.batch_size, device=env.device)
 
 
-def start_of_episodes(env: EnvBase, initial_state: InitialState | None) -> Step:
+def make_start(env: EnvBase, initial_state: InitialState | None) -> Step:
     """Return the recurrent state that every episode starts with; empty without memory."""
     return {} if initial_state is None else dict(initial_state(env.numel()).items())
 
@@ -284,7 +284,7 @@ def _append(steps: list[Step], step: Step, unstored: Sequence[str]) -> None:
     steps.append(step)
 
 
-def in_time_order(steps: Sequence[Step], env: EnvBase) -> TensorDict:
+def stack_steps(steps: Sequence[Step], env: EnvBase) -> TensorDict:
     """Steps as one TensorDict, [rows, steps]."""
     batch = TensorDict(batch_size=[*env.batch_size, len(steps)], device=env.device)
     for key in {**steps[0], **steps[-1]}:

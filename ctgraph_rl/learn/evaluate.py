@@ -18,7 +18,7 @@ from ctgraph_rl.checks import NamedValues, require, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL
 from ctgraph_rl.env import CTGraphEnv
-from ctgraph_rl.learn.collect import InitialState, Policy, act, agent_specs, make_env, start_of_episodes
+from ctgraph_rl.learn.collect import InitialState, Policy, act, agent_specs, make_env, make_start
 from ctgraph_rl.learn.exact import exact_measures, shown_id
 from ctgraph_rl.learn.labels import task_policies
 from ctgraph_rl.learn.logits_policy import as_policy
@@ -92,7 +92,7 @@ def evaluate(
         env = make_env(curriculum, rows, seed, device)
     exploration = ExplorationType.DETERMINISTIC if greedy else ExplorationType.RANDOM
     try:
-        acts = _built_on(env, policy) if isinstance(policy, type) else as_policy(policy, num_actions(env))
+        acts = _build_on(env, policy) if isinstance(policy, type) else as_policy(policy, num_actions(env))
         with torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []):
             torch.manual_seed(seed)
             with set_exploration_type(exploration):
@@ -102,7 +102,7 @@ def evaluate(
     return result.view(len(tasks), num_episodes)
 
 
-def _built_on(env: EnvBase, policy: type) -> Policy:
+def _build_on(env: EnvBase, policy: type) -> Policy:
     known = isinstance(env, CTGraphEnv) or not issubclass(policy, RandomPolicy)
     require((known, f"{policy.__name__} plays only CT-graphs: it knows their hidden state; give a policy of your own"))
     try:
@@ -117,7 +117,7 @@ def num_actions(env: EnvBase) -> int | None:
 
 
 def _first_episodes(env: EnvBase, policy: Policy, initial_state: InitialState | None, num_episodes: int) -> TensorDict:
-    start = start_of_episodes(env, initial_state)
+    start = make_start(env, initial_state)
     first = env.reset().update(start)
     data = dict(first.items(True, True))
     result = first.select("episode_reward", "step_count", "outcome", "leaf", strict=False)
@@ -207,7 +207,7 @@ class Evaluator:
         if self.curriculum.evaluation.exact:
             self._measure(policies, frames, moment, agent.initial_state)
             return
-        policy = _of_each(agent, policies)
+        policy = _join_policies(agent, policies)
         acts = policy.__call__ if isinstance(policy, nn.Module) else policy  # reads TensorDicts whatever it is
         self.evaluate(acts, frames, moment, agent.initial_state)
 
@@ -280,7 +280,7 @@ class Evaluator:
         return {task: name for task, name in named.items() if name[0] in seen or name[0] > len(curriculum.tasks)}
 
 
-def _of_each(agent: Agent, policies: Sequence[Policy]) -> Policy:
+def _join_policies(agent: Agent, policies: Sequence[Policy]) -> Policy:
     """Return the agent's policy where it is that of each task, or else one that acts with each in its slice of rows."""
     return agent.policy if all(policy is agent.policy for policy in policies) else by_slices(policies)
 

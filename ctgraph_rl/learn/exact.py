@@ -99,7 +99,7 @@ def exact_success(policy: ActionProbs | nn.Module, task: Task) -> float:
         >>> round(1 / exact_success(uniform, ct_su_b1()))  # P_R
         243
     """
-    return _of_function(policy, task, 1.0).success_rate
+    return _measure_function(policy, task, 1.0).success_rate
 
 
 @takes_numbers
@@ -112,7 +112,7 @@ def exact_value(policy: ActionProbs | nn.Module, task: Task, gamma: float = 1.0)
         gamma: discount, in [0, 1]; with 1 the mean return.
     """
     require(*fraction(gamma=gamma))
-    return _of_function(policy, task, gamma).return_mean
+    return _measure_function(policy, task, gamma).return_mean
 
 
 def exact_rules(policy: object, task: TaskLike, start: Step) -> Iterator[Rule]:
@@ -178,7 +178,7 @@ def _num_views(task: Task) -> int:
     return task.images.num_variants * (task.observations.read_rotation + 1)
 
 
-def _of_function(policy: ActionProbs | nn.Module, task: Task, gamma: float) -> Measures:
+def _measure_function(policy: ActionProbs | nn.Module, task: Task, gamma: float) -> Measures:
     require((are_graphs([task]), f"exact values are those of CT-graphs, got {type(task).__name__}"))
     acts = as_policy(policy, task.num_actions) if isinstance(policy, nn.Module) else _Function(policy, task.num_actions)
     return exact_measures(acts, task, greedy=False, gamma=gamma)
@@ -327,7 +327,7 @@ class _Enumeration:
                 left.append(self._after(seen, written, (1 - p) * waits, WAIT_ACTION))
                 if stay + 1 < self.stays:
                     staying = self._after(seen, written, p * waits, WAIT_ACTION)
-            leads_on = _joined(left)
+            leads_on = _join(left)
             if level == self.task.graph.depth:
                 self._arrive(leads_on)
             else:
@@ -412,7 +412,7 @@ def _parts(histories: _Histories) -> Iterator[_Histories]:
             yield histories.select(rows)
 
 
-def _joined(parts: Sequence[_Histories]) -> _Histories:
+def _join(parts: Sequence[_Histories]) -> _Histories:
     state = {key: torch.cat([part.state[key] for part in parts]) for key in parts[0].state}
     node, weight, discount = (
         torch.cat([getattr(part, name) for part in parts]) for name in ("node", "weight", "discount")

@@ -81,14 +81,14 @@ class LogitsPolicy:
 
 def _takes_ids(function: Any) -> bool:
     try:
-        places = positional(function)
+        places = positional_parameters(function)
     except ValueError:  # of a traced module, which has none
         return False
     return sum(p.default is p.empty for p in places) == 2 or [p.name for p in places[1:2]] == ["task_id"]
 
 
-def positional(function: Any) -> list[Parameter]:
-    """Return the positional parameters of a function."""
+def positional_parameters(function: Any) -> list[Parameter]:
+    """Return the positional_parameters parameters of a function."""
     kinds = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
     return [parameter for parameter in signature(function).parameters.values() if parameter.kind in kinds]
 

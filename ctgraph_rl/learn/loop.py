@@ -296,7 +296,7 @@ class Lockstep:
             if number in self.failed:
                 continue
             try:
-                measurements = {**_finite(measured), **share}
+                measurements = {**_require_finite(measured), **share}
             except FloatingPointError as error:
                 where = f"in block {self.block} after {self.frames} frames; the run stops here"
                 seed = "" if self.group.generators is None else f"seed {self.seeds[number]}: "
@@ -311,7 +311,7 @@ class Lockstep:
         """Return all that the rest of each member's run depends on, as tensors and plain values."""
         assert self._carried is not None, "nothing was learned yet"
         count = len(self.logs)
-        of_env = _divided(self.env.state_dict(), count)
+        of_env = _divide(self.env.state_dict(), count)
         of_data = [self._carried] if count == 1 else [part.clone() for part in self._carried.chunk(count)]
         states = []
         for number, (agent, log) in enumerate(zip(self.group.agents, self.logs, strict=True)):
@@ -331,7 +331,7 @@ class Lockstep:
     def _restore(self, saved: Sequence[SavedState]) -> TensorDictBase:
         self._restore_agents(saved)
         with saved_state_fits():
-            self.env.load_state_dict(_joined([state["env"] for state in saved]))
+            self.env.load_state_dict(_join([state["env"] for state in saved]))
         rows = [self.env.numel() // len(saved)]
         data = [TensorDict(state["carried"], rows, device=self.env.device) for state in saved]
         return data[0] if len(data) == 1 else torch.cat(data)
@@ -378,7 +378,7 @@ def run_loop(
             checkpoint(members.state, members.is_at_block_end)
 
 
-def _finite(measured: Learnt) -> dict[str, float]:
+def _require_finite(measured: Learnt) -> dict[str, float]:
     """Return what was measured.
 
     Raises:
@@ -392,7 +392,7 @@ def _finite(measured: Learnt) -> dict[str, float]:
     return measured
 
 
-def _divided(state: NamedValues, count: int) -> list[NamedValues]:
+def _divide(state: NamedValues, count: int) -> list[NamedValues]:
     if count == 1:
         return [state]
     parts: list[NamedValues] = [{} for _ in range(count)]
@@ -402,7 +402,7 @@ def _divided(state: NamedValues, count: int) -> list[NamedValues]:
     return parts
 
 
-def _joined(states: Sequence[NamedValues]) -> NamedValues:
+def _join(states: Sequence[NamedValues]) -> NamedValues:
     if len(states) == 1:
         return states[0]
     return {key: torch.cat([state[key] for state in states]) for key in states[0]}

@@ -136,7 +136,7 @@ def log_training(
     """
     frames = start
     end = start + batch.numel()
-    for part in _of_one_block(batch, start, curriculum.ends):
+    for part in _split_at_ends(batch, start, curriculum.ends):
         frames += part.numel()
         after = part["next"]
         episodes = episode_means(after.select(*EPISODE_KEYS, strict=False)[after["done"].squeeze(-1)])
@@ -147,7 +147,7 @@ def log_training(
     return episodes["return_mean"]
 
 
-def _of_one_block(batch: TensorDictBase, start: int, ends: Sequence[int]) -> Iterator[TensorDictBase]:
+def _split_at_ends(batch: TensorDictBase, start: int, ends: Sequence[int]) -> Iterator[TensorDictBase]:
     """Cut a batch that begins after ``start`` frames where blocks end within it."""
     rows, steps = batch.shape
     first = bisect_right(ends, start)

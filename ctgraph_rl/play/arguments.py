@@ -65,28 +65,28 @@ def select(arguments: argparse.Namespace) -> Selection:
     changes |= {"fully_observable": False} if arguments.surjective else {}
     if arguments.run is not None:
         require((arguments.name is None and not changes, "--run names the curriculum: choose its task with --task"))
-        return _of_run(arguments.run, arguments.task)
+        return _select_of_run(arguments.run, arguments.task)
     policy = None if arguments.policy is None else POLICIES[arguments.policy]
-    return _named(arguments.name, arguments.task, changes, arguments.config_dir)._replace(policy=policy)
+    return _select_task(arguments.name, arguments.task, changes, arguments.config_dir)._replace(policy=policy)
 
 
-def _named(name: str | None, number: int, changes: NamedValues, config_dir: Path | None) -> Selection:
+def _select_task(name: str | None, number: int, changes: NamedValues, config_dir: Path | None) -> Selection:
     own = name in curriculum_names(config_dir)
     if name is None:
-        return _called("CT-graph", make_task(**changes))
+        return _name_task("CT-graph", make_task(**changes))
     if not own and name.endswith(".json"):
-        return _called(name, make_task(config=name, **changes))
+        return _name_task(name, make_task(config=name, **changes))
     if not own and "-" in name:  # as in the paper's labels and in no curriculum's name
-        return _called(name.upper(), make_task(name.upper(), **changes))
+        return _name_task(name.upper(), make_task(name.upper(), **changes))
     require((not changes, f"the tasks of a curriculum cannot be changed here: {name} takes no {', '.join(changes)}"))
-    return _of_curriculum(curriculum_of(name, config_dir), number)
+    return _select_of_curriculum(curriculum_of(name, config_dir), number)
 
 
-def _called(name: str, task: Task) -> Selection:
+def _name_task(name: str, task: Task) -> Selection:
     return Selection(task, f"{name}, goal {in_digits(task.goal, '.')}")
 
 
-def _of_curriculum(curriculum: Curriculum, number: int) -> Selection:
+def _select_of_curriculum(curriculum: Curriculum, number: int) -> Selection:
     tasks = ct_graphs(curriculum.tasks, "a drawing or a game")
     labels = curriculum.labels
     rule = f"--task must be in 1..{len(tasks)}, the tasks of {curriculum.name}, got {number}"
@@ -94,9 +94,9 @@ def _of_curriculum(curriculum: Curriculum, number: int) -> Selection:
     return Selection(tasks[number - 1], f"{curriculum.name}, task {number}: {labels[number - 1]}")
 
 
-def _of_run(run: Path, number: int) -> Selection:
+def _select_of_run(run: Path, number: int) -> Selection:
     trained = load(run)
-    selection = _of_curriculum(trained.curriculum, number)
+    selection = _select_of_curriculum(trained.curriculum, number)
     policy = trained.policy_for(selection.task)
     initial_state = trained.agent.initial_state
     return selection._replace(policy=policy, initial_state=initial_state, curriculum=trained.curriculum)

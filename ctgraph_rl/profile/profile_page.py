@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ctgraph_rl.disk import made_folder, write_whole
+from ctgraph_rl.disk import make_folder, write_whole
 from ctgraph_rl.log.escape import csv_text, markdown_table, markdown_text
 from ctgraph_rl.log.files import locked
 from ctgraph_rl.profile.scoring import Profiles, profile_scores
@@ -53,7 +53,7 @@ def write_profile(paths: Sequence[Path | str], folder: Path | str, agents: Seque
     shown = [[title, *(str(of_agent[title]) for of_agent in scores.values())] for title in titles]
     measured = [[title, *(of_agent[title].absolute for of_agent in scores.values())] for title in titles]
     table = Table(f"Profile. {MEANING}", "profile", "agent", titles, cells)
-    folder = made_folder(Path(folder))
+    folder = make_folder(Path(folder))
     with locked(folder):
         write_whole(folder / "profile.csv", csv_text(rows))
         write_whole(folder / "profile.tex", document([table]) + "\n")

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from ctgraph_rl import __version__
 from ctgraph_rl.checks import require
-from ctgraph_rl.disk import is_writable, made_folder, write_whole
+from ctgraph_rl.disk import is_writable, make_folder, write_whole
 from ctgraph_rl.learn.progress import Count, silent
 from ctgraph_rl.log.files import locked
 from ctgraph_rl.report import formats, results
@@ -120,7 +120,7 @@ def write_report(
         pass  # refuses before any work
     if folder is None:
         within = len(paths) == 1 and is_writable(paths[0])
-        folder = made_folder(Path(paths[0]) / "report" if within else Path("report"))
+        folder = make_folder(Path(paths[0]) / "report" if within else Path("report"))
     found = sections(runs, count)
     num_agents = sum(min(len(section.results), MOST_AGENTS) for section in found)
     most = 1 + len(found) * len(OF_SECTION) + num_agents * len(OF_AGENT)

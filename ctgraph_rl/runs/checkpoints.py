@@ -20,7 +20,7 @@ from typing import Any
 import torch
 
 from ctgraph_rl.checks import as_path, is_int, not_negative, require, true_or_false
-from ctgraph_rl.disk import PART, made_folder, require_no_link, sync_folder, write_whole
+from ctgraph_rl.disk import PART, make_folder, require_no_link, sync_folder, write_whole
 from ctgraph_rl.log.saved import read_content, read_plain
 from ctgraph_rl.log.sums import sum_of
 from ctgraph_rl.runs.interrupt import Interrupt
@@ -101,7 +101,7 @@ class Checkpoints:
                 read_plain(content.partition(b"\n")[2])
             except ValueError as error:  # it could be written and never read
                 raise ValueError(f"{NOT_PLAIN}: {error.__cause__}") from error
-        made_folder(self.folder)
+        make_folder(self.folder)
         try:
             write_whole(path, content)
         except OSError as error:

@@ -39,7 +39,7 @@ from ctgraph_rl.checks import (
     positive,
     require,
 )
-from ctgraph_rl.disk import made_folder, write_whole
+from ctgraph_rl.disk import make_folder, write_whole
 from ctgraph_rl.log.named_curricula import curriculum_named
 from ctgraph_rl.packages import check_packages, conf_dir, importing_from_here
 from ctgraph_rl.portable import check_portable
@@ -398,7 +398,7 @@ def with_names(names: Mapping[str, str | None], config_dir: Path | None = None) 
 
 def write_configuration(cfg: DictConfig, folder: Path) -> None:
     """Write the files that Hydra writes, but only after all checks."""
-    made_folder(folder)
+    make_folder(folder)
     save_yaml(cfg, folder / "config.yaml")
     if HydraConfig.initialized():
         save_yaml(HydraConfig.instance().cfg, folder / "hydra.yaml")

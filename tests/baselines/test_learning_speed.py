@@ -27,7 +27,7 @@ from baselines.update.update import update
 from benchmarks import agents as benchmark
 from benchmarks import environment_ladder as ladder_of_envs
 from ctgraph_rl import CTGraphEnv
-from ctgraph_rl.learn.collect import collect, in_time_order, take_step
+from ctgraph_rl.learn.collect import collect, stack_steps, take_step
 from curricula.paper import ct_su_b1
 
 
@@ -47,7 +47,7 @@ def test_a_step_in_plain_tensors_equals_torchrls():
         others.append(expected)
         assert set(data) == set(other.keys()) and all((data[key] == other[key]).all() for key in data)
 
-    batch, expected = in_time_order(steps, plain), torch.stack(others, dim=1)
+    batch, expected = stack_steps(steps, plain), torch.stack(others, dim=1)
     assert expected["next", "done"].any()
     assert set(batch.keys(True, True)) == set(expected.keys(True, True)) and (batch == expected).all()
 

@@ -27,7 +27,7 @@ from benchmarks.environments import configurations
 from ctgraph_rl import Block, CTGraphEnv, Rows, RunLog, Steps, learn_curriculum, make_agent, rollout
 from ctgraph_rl.core.region import Region
 from ctgraph_rl.learn import collect
-from ctgraph_rl.learn.collect import CapturedAct, in_time_order, start_of_episodes
+from ctgraph_rl.learn.collect import CapturedAct, make_start, stack_steps
 from ctgraph_rl.runs.config import target
 
 META = torch.device("meta")
@@ -110,7 +110,7 @@ def test_neither_acting_nor_learning_needs_the_host(name, compose, captured, swa
     agent = agent_of(compose, name, env).to(META)
     for optimiser in (each for each in vars(agent).values() if isinstance(each, torch.optim.Optimizer)):
         optimiser.param_groups[0] |= {"fused": False, "foreach": False}  # unknown on this device
-    start, steps = start_of_episodes(env, agent.initial_state), []
+    start, steps = make_start(env, agent.initial_state), []
     act, carried = CapturedAct(env, agent.policy, start), dict(env.reset().to(META).update(start).items(True, True))
     env.rows.to(META)
     env._device = META
@@ -119,7 +119,7 @@ def test_neither_acting_nor_learning_needs_the_host(name, compose, captured, swa
         for _ in range(agent.num_steps):
             step, carried = act(carried)
             steps.append(step)
-    minibatches = islice(agent.minibatches(in_time_order(steps, env)), 2)
+    minibatches = islice(agent.minibatches(stack_steps(steps, env)), 2)
     measured = [agent.gradient_step(minibatch) for minibatch in minibatches]
 
     assert {value.device for step in measured for value in step.values()} == {META}
@@ -153,7 +153,7 @@ def test_neither_acting_nor_learning_of_several_seeds_needs_the_host(
     group = CapturedGroup(agents, [torch.Generator().manual_seed(seed) for seed in range(3)])
     for learner in group.learners:
         learner.optimiser.param_groups[0] |= {"fused": False, "foreach": False}  # unknown on this device
-    start, steps = start_of_episodes(env, group.first.initial_state), []
+    start, steps = make_start(env, group.first.initial_state), []
     act, carried = CapturedAct(env, group.policy, start), dict(env.reset().to(META).update(start).items(True, True))
     env.rows.to(META)
     env._device = META
@@ -164,7 +164,7 @@ def test_neither_acting_nor_learning_of_several_seeds_needs_the_host(
             for _ in range(group.first.num_steps):
                 step, carried = act(carried)
                 steps.append(step)
-        minibatches = islice(group.first.minibatches_of(in_time_order(steps, env), group.seeds), 2)
+        minibatches = islice(group.first.minibatches_of(stack_steps(steps, env), group.seeds), 2)
         measured = [group.gradient_step(minibatch) for minibatch in minibatches]
         group.stack.write()
 
@@ -224,7 +224,7 @@ def test_acting_is_captured_again_where_rows_have_other_tasks(small_agent):
     one, other = confounding(), confounding(goal=(2, 2))
     env = CTGraphEnv([one] * 2, task_pool=[one, other])
     agent = small_agent("ppo", [one])
-    act = CapturedAct(env, agent.policy, start_of_episodes(env, agent.initial_state))
+    act = CapturedAct(env, agent.policy, make_start(env, agent.initial_state))
     regions = []
 
     for task in (one, other, None):

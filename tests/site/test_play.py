@@ -99,7 +99,7 @@ def trajectory(given: dict[str, Any], seed: int) -> tuple[list[int], dict[str, A
     found |= {"kind": state.state_type, **{name: getattr(state, name) for name in ("node", "tick", "step_count")}}
     found |= {name: getattr(state, name) for name in ("episode_reward", "reward", "paid")}
     sums = {name: hashlib.sha256(value.contiguous().numpy().tobytes()).hexdigest() for name, value in found.items()}
-    packed = [str(number) for number in native._packed(rows.engine.tables)[0].tolist()]
+    packed = [str(number) for number in native._pack(rows.engine.tables)[0].tolist()]
     return action.tolist(), {"packed": packed, "sums": sums}
 
 

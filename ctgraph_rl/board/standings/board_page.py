@@ -16,7 +16,7 @@ from ctgraph_rl.board.standings import board_formats as formats
 from ctgraph_rl.board.standings.board_tables import BoardTable, tables
 from ctgraph_rl.board.standings.entries import LEVELS, BoardEntry, read_entries, shown_level
 from ctgraph_rl.checks import require
-from ctgraph_rl.disk import made_folder, write_whole
+from ctgraph_rl.disk import make_folder, write_whole
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.report.style import require_packages
@@ -56,7 +56,7 @@ def write_board(
     entries, problems = read_entries(paths, config_dir)
     require((bool(entries), why_left_out(problems)))
     made = tables(entries)
-    folder = made_folder(Path(folder))
+    folder = make_folder(Path(folder))
     files = {
         PAGE: html(made, problems),
         "board.md": formats.markdown(made),

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ctgraph_rl.disk import made_folder, write_whole
+from ctgraph_rl.disk import make_folder, write_whole
 from ctgraph_rl.draw.style import picture
 from ctgraph_rl.report.style import style
 
@@ -63,7 +63,7 @@ class Gallery:
         self._count = count
         self._done = 0
         self._taken: set[str] = set()
-        made_folder(folder / FOLDER)
+        make_folder(folder / FOLDER)
 
     def write(self, names: tuple[str, ...], figures: Iterable[CaptionedFigure | None]) -> list[Written]:
         """Draw and write figures, skipping None; their file names start with ``names``."""
