@@ -47,8 +47,7 @@ class Agent(Protocol):
     def initial_state(self, num_envs: int) -> TensorDict:
         """Return the recurrent state of ``num_envs`` rows before their first observation; empty without memory.
 
-        Every episode starts with it, unless it has a key ``trial``: such a state lasts over episodes, and the policy
-        resets it itself.
+        Every episode starts with it. A state with a key ``trial`` lasts over episodes: the policy resets it.
         """
         ...
 

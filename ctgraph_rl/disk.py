@@ -25,9 +25,7 @@ PART = ".part"
 
 
 def write_whole(path: str | os.PathLike[str], content: bytes | str, synced: bool = True) -> None:
-    """Write a file so that a reader, also after a crash, finds the old content or the new.
-
-    A link at its place is replaced, its target stays unchanged.
+    """Write a file so that a reader, also after a crash, finds the old content or the new; a link is replaced.
 
     Args:
         path: the file.
@@ -236,7 +234,7 @@ def read_text(path: str | os.PathLike[str], most: int) -> str:
 
 
 def read_regular(path: str | os.PathLike[str], most: int) -> bytes:
-    """Return the content of a regular file, which is not opened where it is a pipe or a device.
+    """Return the content of a regular file; a pipe or a device is not opened.
 
     Args:
         path: the file, or a link to it.

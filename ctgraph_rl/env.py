@@ -34,21 +34,21 @@ RowData = dict[str, Tensor]
 class CTGraphEnv(EnvBase):
     """A batch of CT-graphs, ``batch_size=[len(tasks)]``; every row has its own task.
 
-    A row's trajectory depends only on (seed, row number, its actions): rows 4..7 of a batch of eight equal a batch of
-    four with ``first_row=4``. Rows may differ in every field of `Task` but the kind and size of the observations.
+    A row's trajectory depends only on seed, row number and actions: rows 4..7 of eight equal a batch of four with
+    ``first_row=4``. Rows may differ in all of `Task` but the kind and size of observations.
 
     Observation keys, for N rows:
 
     - ``observation``: uint8 [N, 1, r, r], or [N, K] when one-hot.
     - ``is_init``: bool [N, 1], True at the first observation of an episode.
-    - ``step_count``: int64 [N, 1], steps taken in the episode. It reveals the phase: no policy should read it.
-    - ``episode_reward``: float32 [N, 1], sum of the episode's rewards so far.
+    - ``step_count``: int64 [N, 1], steps of the episode. It reveals the phase: no policy should read it.
+    - ``episode_reward``: float32 [N, 1], sum of the episode's rewards.
     - ``outcome``: uint8 [N, 1]: 0 running, 1 fail, 2 another end state, 3 the goal.
-    - ``leaf``: int64 [N, 1], the end state arrived at, else -1.
+    - ``leaf``: int64 [N, 1], the end state reached, else -1.
 
-    ``action`` is int64 [N]: 0 waits, 1..b decides; the home state takes any action, and an action above a row's own b
-    fails as a wrong one does. ``reward`` is float32 [N, 1], paid on entering an end or fail state. These states are
-    terminal, as in the paper; ``truncated`` is always False (wrap in TorchRL's ``StepCounter`` for a time limit).
+    ``action`` is int64 [N]: 0 waits, 1..b decides. Home takes any action; one above a row's own b fails. ``reward`` is
+    float32 [N, 1], paid on entering an end or fail state. These are terminal, as in the paper; ``truncated`` is always
+    False (TorchRL's ``StepCounter`` adds a time limit).
 
     For tests and analysis, never in the data: ``state_type``, ``node``, ``goal_leaf``, ``observation_id``. For
     planners, `get_state` and ``reset(TensorDict(state=...), set_state=True)`` save and restore rows.
@@ -59,15 +59,15 @@ class CTGraphEnv(EnvBase):
         first_row: number of the first row, for a batch that is split.
         task_pool: the tasks that `set_tasks` may be given; specs and images are fixed by it. Default: ``tasks``.
         device: where the tensors live.
-        check_actions: refuse actions of a wrong shape, dtype or range, and steps of finished rows, with a
-            ``ValueError``. False trusts them for speed; on a GPU the check waits for the device at every step.
+        check_actions: refuse actions of a wrong shape, dtype or range, and steps of finished rows. False trusts them;
+            on a GPU the check waits for the device at every step.
         noise_bank: 0, or from how many noises drawn in advance an observation takes its own: see `Rows`.
         task_ids: the id of each task, an integer >= 0. Observations then have ``task_id``, uint8 [N, num_task_ids]: the
             row's id as one-hot, zeros for a task without one.
         num_task_ids: length of ``task_id``; None: just enough.
         kernel: ``"auto"``, ``"off"`` or ``"required"``, whether the C kernel takes the steps: see `Rows`.
-        info: False leaves ``step_count``, ``episode_reward``, ``outcome``, ``leaf`` and ``truncated`` out of the data,
-            so that TorchRL has less to copy; all else is the same.
+        info: False leaves out ``step_count``, ``episode_reward``, ``outcome``, ``leaf`` and ``truncated``, so that
+            TorchRL copies less.
 
     Raises:
         ValueError: for no tasks, values out of range, observations of different shapes, and what a required kernel
@@ -186,9 +186,8 @@ class CTGraphEnv(EnvBase):
     def get_state(self) -> TensorDict:
         """A copy of the rows' states, to go back to with ``reset(TensorDict(state=state), set_state=True)``.
 
-        It holds the hidden Markov state: a planner may see it, a policy may not. Rows of it may be put in any order, to
-        branch several rows off one; their further randomness is that of their row numbers. With a ``_reset`` mask,
-        give a clone: TorchRL writes into the TensorDict of a partial reset.
+        It holds the hidden Markov state, which no policy may see. Its rows may be put in any order; their further
+        randomness is that of their row numbers. With a ``_reset`` mask, give a clone: TorchRL writes into it.
         """
         fields = {field: value.clone() for field, value in self.rows.state._asdict().items()}
         return TensorDict(fields, batch_size=self.batch_size, device=self.device)
@@ -237,10 +236,7 @@ class CTGraphEnv(EnvBase):
         return self._tensordict(self.step_data(tensordict.get("action", None), mask))
 
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        """The standard method without its question whether any row is done and without its merge of two TensorDicts.
-
-        The data are equal to those of the standard method, which TorchRL takes when the environment is wrapped.
-        """
+        """The standard method with equal data, without asking whether any row is done and without a merge."""
         if "_step" in tensordict:
             return super()._step_and_maybe_reset(tensordict)
         tensordict = self.step(tensordict.to(self.device) if tensordict.device != self.device else tensordict)
@@ -253,11 +249,10 @@ class CTGraphEnv(EnvBase):
         return tensordict, tensordict_
 
     def rollout(self, *args: Any, **kwargs: Any) -> TensorDictBase:
-        """`EnvBase.rollout` with the same data, [N, T], in memory that is time-major: step after step, like the steps.
+        """`EnvBase.rollout` with the same data, [N, T], in time-major memory, which is faster to fill.
 
-        Stacking [N] to [N, T] copies a row at a time, 1 to 144 bytes, and takes most of the time of a large batch. As
-        of any transposed tensor, ``reshape`` copies and ``view`` refuses to merge rows and steps. Memory in the order
-        of the rows is made for ``return_contiguous=True``, and as ever for ``out`` and ``set_truncated``.
+        ``reshape`` then copies, and ``view`` refuses to merge rows and steps. Memory is row-major for
+        ``return_contiguous=True``, ``out`` and ``set_truncated``.
         """
         row_major = kwargs.get("out") is not None or kwargs.get("set_truncated")
         if row_major or kwargs.get("return_contiguous", False) is not False:
@@ -279,7 +274,7 @@ class CTGraphEnv(EnvBase):
         return self._keep_steps(super()._rollout_stop_early(**kwargs))
 
     def _keep_steps(self, steps: list[TensorDictBase]) -> list[TensorDictBase]:
-        """What the stock `rollout` is to stack: nothing of a step where this class stacks the steps itself."""
+        """Keep the steps for `rollout`, which stacks them itself; return what the stock method stacks."""
         if self._steps is None:
             return steps
         self._steps.extend(steps)
@@ -288,13 +283,12 @@ class CTGraphEnv(EnvBase):
     def step_data(self, action: Tensor | None, mask: Tensor | None = None) -> RowData:
         """Step all rows; return the data after the step by key, ``reward`` among them.
 
-        This and `restart_data` are a step for loops that keep tensors. Values may share memory with each other and with
-        the rows' state: do not write into them.
+        Values may share memory with each other and with the rows' state: do not write into them.
 
         Args:
             action: int64 [N].
-            mask: bool [N], TorchRL's ``_step``: the rows to step. The others stay unchanged, draw nothing and have
-                the data of before, with reward 0. None: all rows.
+            mask: bool [N], TorchRL's ``_step``: the rows to step, None: all. The others stay unchanged, draw nothing
+                and have reward 0.
 
         Raises:
             ValueError: for actions that ``check_actions`` refuses.
@@ -313,7 +307,7 @@ class CTGraphEnv(EnvBase):
         return data
 
     def step_and_restart_data(self, action: Tensor | None) -> tuple[RowData, RowData]:
-        """Return what `step_data` returns, and then `restart_data` for the rows that are done; on CPUs in one call."""
+        """Return `step_data`, and `restart_data` for the rows that are done; on CPUs in one call of the kernel."""
         rows = self.rows
         stepped = None
         if rows.uses_kernel and not rows.tasks_change:

@@ -19,9 +19,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ctgraph_rl.batch.assignment import find_numbers
+from ctgraph_rl.batch.assignment import find_numbers, require_num_ids
 from ctgraph_rl.batch.rows import Rows, seed_rule
-from ctgraph_rl.batch.shown_ids import add_task_ids, with_id
 from ctgraph_rl.checks import NamedValues, Rule, as_int, as_tuple, is_int, require, takes_numbers
 from ctgraph_rl.core.dynamics import NO_LEAF, OUTCOME_RUNNING, Shown, choose
 from ctgraph_rl.draw.pixels import render
@@ -117,7 +116,7 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
             self.rows.set_seed(first)
         self._is_over = False
         info = {"task": self._number, "outcome": OUTCOME_RUNNING, "leaf": NO_LEAF}
-        return with_id(self.rows.restart().numpy()[0], self._ids, self._number), info
+        return add_id(self.rows.restart().numpy()[0], self._ids, self._number), info
 
     @torch.inference_mode()
     def step(self, action: int) -> tuple[Any, float, bool, bool, NamedValues]:
@@ -139,7 +138,7 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
         leaf = NO_LEAF
         if self._is_over:
             outcome, leaf = (int(value.item()) for value in self.rows.result(done))
-        shown = with_id(observation.numpy()[0], self._ids, self._number)
+        shown = add_id(observation.numpy()[0], self._ids, self._number)
         info = {"task": self._number, "outcome": outcome, "leaf": leaf}
         return shown, self.rows.reward.item(), self._is_over, False, info
 
@@ -245,7 +244,7 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         self._change_tasks(mask)
         self._is_over = self._is_over & ~mask
         shown = self.rows.reset(torch.from_numpy(mask))
-        return with_id(shown.observation.numpy(), self._ids, self._numbers), self._infos(shown, mask)
+        return add_id(shown.observation.numpy(), self._ids, self._numbers), self._infos(shown, mask)
 
     @torch.inference_mode()
     def step(self, actions: NDArray[np.int64]) -> tuple[Any, NumpyArray, NumpyArray, NumpyArray, NamedValues]:
@@ -269,14 +268,14 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         else:
             self._is_over = done
             infos = self._infos(shown)
-        observation = with_id(shown.observation.numpy(), self._ids, self._numbers)
+        observation = add_id(shown.observation.numpy(), self._ids, self._numbers)
         return observation, rewards, done.copy(), np.zeros_like(done), infos
 
     def _restart(self, done: RowMask, final: Shown) -> tuple[Shown, NamedValues]:
         """Start an episode in rows that are done; what is shown then, and the infos with what was shown last."""
         last = np.full(self.num_envs, None, dtype=object)
         for i, observation in zip(done.nonzero()[0], final.observation.numpy()[done], strict=True):
-            last[i] = with_id(observation, self._ids, self._numbers[i])
+            last[i] = add_id(observation, self._ids, self._numbers[i])
         infos: NamedValues = {"final_obs": last, "_final_obs": done.copy()}
         infos |= {"final_info": self._infos(final, done), "_final_info": done.copy()}
         self._change_tasks(done)
@@ -344,6 +343,34 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
     def render(self) -> tuple[Frame, ...] | None:
         """The present state of every row as a picture, uint8 [192, 384, 3], or as text."""
         return _frames(self)
+
+
+def add_task_ids(
+    space: spaces.Space[Any], pool: Sequence[Task], task_ids: Mapping[Task, int] | None, num_task_ids: int | None
+) -> tuple[spaces.Space[Any], NDArray[np.uint8] | None]:
+    """Return the space of observations with ids of tasks, and the id of each task of a pool as one-hot.
+
+    Args:
+        space: of observations without ids.
+        pool: the tasks.
+        task_ids: their ids; None: the space stays unchanged, and there are none.
+        num_task_ids: length of an id; None: just enough.
+
+    Raises:
+        ValueError: for a task without an id, and ids that do not fit the length.
+    """
+    length = require_num_ids(task_ids, num_task_ids)
+    if task_ids is None:
+        return space, None
+    without = [each for each in pool if each not in task_ids]
+    require((not without, f"task_ids must name every task of the pool, got none for {without[:3]}"))
+    ids = np.eye(length, dtype=np.uint8)[[int(task_ids[each]) for each in pool]]
+    return spaces.Dict({"observation": space, "task_id": spaces.Box(0, 1, (length,), np.uint8)}), ids
+
+
+def add_id(observation: NDArray[np.uint8], ids: NDArray[np.uint8] | None, task: Any) -> Any:
+    """Return an observation, or those of a batch, with the ids of the numbered tasks, if there are ids."""
+    return observation if ids is None else {"observation": observation, "task_id": ids[task].copy()}
 
 
 def _spaces(rows: Rows) -> tuple[spaces.Space[Any], spaces.Space[Any]]:

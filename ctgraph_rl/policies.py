@@ -32,7 +32,7 @@ class RandomPolicy:
         return tensordict.set("action", self.action(tensordict))
 
     def action(self, tensordict: TensorDictBase) -> Tensor:
-        """The actions of all rows."""
+        """Return the actions of all rows, int64 [N]."""
         return self._random_below(self.env.branching_factor + 1)
 
     def _random_below(self, high: Tensor) -> Tensor:
@@ -83,11 +83,10 @@ class OptimalPolicy(NavigationPolicy):
 class SearchPolicy(OptimalPolicy):
     """Tries end states without replacement until it finds the goal, then stays with it until an episode misses it.
 
-    It knows the graph, and of the goal only whether its own last episode reached it. Each row goes through the end
-    states in order from a random one on: the number of the episode that finds the goal is uniform on 1..b^d and has the
-    mean E[kappa] = (b^d + 1) / 2. Once a goal has been drawn again, episode i with it succeeds with probability
-    min(1, i / b^d), too, as the search begins with the last goal. An episode that is cut before the last wait state is
-    tried again.
+    It knows the graph, and of the goal only whether its last episode reached it. Each row goes through the end states
+    in order from a random one on, so the episode that finds the goal is uniform on 1..b^d with mean
+    E[kappa] = (b^d + 1) / 2. After a new draw of the goal, episode i with it succeeds with probability
+    min(1, i / b^d). An episode that is cut before the last wait state is tried again.
     """
 
     def __init__(self, env: CTGraphEnv) -> None:

@@ -10,9 +10,8 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ctgraph_rl.batch.shown_ids import add_task_ids, with_id
 from ctgraph_rl.checks import NamedValues, Rule, require, takes_numbers
-from ctgraph_rl.gym import CTGraphVectorEnv
+from ctgraph_rl.gym import CTGraphVectorEnv, add_id, add_task_ids
 from ctgraph_rl.tasks.task import Task
 
 try:
@@ -57,7 +56,7 @@ class SB3VecEnv(VecEnv):
         self.metadata = self.envs.metadata
 
     def _shown(self, observation: NDArray[np.uint8], tasks: Any) -> Any:
-        return with_id(observation, self._ids, tasks)
+        return add_id(observation, self._ids, tasks)
 
     def reset(self) -> Any:
         """Start an episode in all rows, with the seeds that ``seed`` was given before."""

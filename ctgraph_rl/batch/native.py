@@ -113,7 +113,7 @@ class Native:
     def observe(
         self, state: RowState, action: Tensor | None, mask: Tensor | None, shown: Tensor | None = None
     ) -> tuple[RowState, Observed]:
-        """`take` for what is observed alone: every finished row is in the mask; without actions, None is all rows."""
+        """`take` for observations only: every finished row is in the mask; without actions, None is all rows."""
         if action is None and mask is None:
             mask = torch.ones_like(state.node, dtype=torch.bool)
         state, made = self.take(state, action, mask, shown)

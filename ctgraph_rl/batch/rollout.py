@@ -21,10 +21,7 @@ TensorPolicy = Callable[[Tensor, Tensor], Tensor]
 
 
 class Steps(NamedTuple):
-    """T steps of N rows. Finished rows are reset at once, so every entry is a step that was taken.
-
-    What was seen at the end of an episode is not kept: it is terminal, so nothing is to be learned from it.
-    """
+    """T steps of N rows. Finished rows are reset at once; what is seen at the end of an episode is not kept."""
 
     observation: Tensor  # uint8 [T + 1, N, *shape]; number t is seen before action t, number T comes after the last one
     is_init: Tensor  # bool [T + 1, N]: the observation is the first of an episode
@@ -54,8 +51,7 @@ class Steps(NamedTuple):
 def rollout(rows: Rows, policy: TensorPolicy | Tensor, steps: Steps, kernel: str = "auto") -> Steps:
     """Fill buffers with steps, from where the rows are; rows that have not begun or are finished start first.
 
-    The steps are those that `CTGraphEnv` and the Gymnasium environments take with the same seeds and actions, bit for
-    bit.
+    The steps have the bits of `CTGraphEnv` and the Gymnasium environments with the same seeds and actions.
 
     Args:
         rows: the batch. It is left where the last step led.

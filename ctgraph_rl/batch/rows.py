@@ -30,8 +30,7 @@ T = TypeVar("T")
 class Rows(TakesNumbers, nn.Module):
     """A batch of CT-graphs without TorchRL or Gymnasium: one task, one random stream and one state per row.
 
-    ``state`` is replaced at every step and never written into, so references to it stay valid. Its fields are buffers:
-    they are in ``state_dict()`` and follow ``to()``.
+    ``state`` is replaced at every step and never written into. Its fields are buffers, which follow ``to()``.
 
     Args:
         tasks: one task per row.
@@ -39,13 +38,11 @@ class Rows(TakesNumbers, nn.Module):
         first_row: number of the first row, for a batch that is split.
         task_pool: the tasks that `set_tasks` may be given; the images are fixed by it. Default: ``tasks``.
         device: where the tensors live.
-        noise_bank: 0 draws the noise of every pixel of every observation. A number M >= 1 takes each observation's
-            noise from M that were drawn in advance, which is faster; two observations then have the same noise with
-            probability 1 / M, where the first way hardly ever repeats noise.
-        kernel: whether the C kernel takes the steps. It has the bits of the tensor engine and needs a CPU, a C compiler
-            and a pool whose rewards are this package's own. ``"auto"`` uses it where it can run and steps are not
-            traced by ``torch.compile`` or another transform, else the tensor engine; ``"off"`` never uses it;
-            ``"required"`` refuses what it cannot run. `uses_kernel` tells which engine is in use.
+        noise_bank: 0 draws the noise of every pixel of every observation. M >= 1 takes each observation's noise from M
+            drawn in advance, which is faster; two observations then share noise with probability 1 / M.
+        kernel: whether the C kernel takes the steps, with the bits of the tensor engine. It needs a CPU, a C compiler
+            and rewards of this package. ``"auto"`` uses it where it can run and steps are not traced, as by
+            ``torch.compile``; ``"off"`` never does; ``"required"`` refuses what it cannot run.
 
     Raises:
         ValueError: for no tasks, values out of range, observations of different shapes, and what a required kernel
@@ -121,7 +118,7 @@ class Rows(TakesNumbers, nn.Module):
         return self.row.device
 
     def _choose_engine(self) -> None:
-        """Find out whether the kernel can run these rewards on this device; refuse that it cannot where it must."""
+        """Find out whether the kernel can run; refuse that it cannot where it must."""
         reward_fns = [task.reward_fn for task in self.pool]
         if self.kernel == "required":
             require_kernel(reward_fns, self.device)
@@ -167,8 +164,8 @@ class Rows(TakesNumbers, nn.Module):
 
         Args:
             tasks: one task of the pool per row.
-            at_episode_end: every row ends its episode first, and has the new task from its next reset on. False: all
-                episodes end at once: `reset` before the next step.
+            at_episode_end: a row has the new task from its next reset on. False: all episodes end at once: `reset`
+                before the next step.
 
         Raises:
             ValueError: if the number of tasks is not the number of rows, or a task is not in the pool.
@@ -228,10 +225,7 @@ class Rows(TakesNumbers, nn.Module):
         self.native.bind(params, self.tables)
 
     def _start_episodes(self, mask: Tensor | None) -> None:
-        """Before the rows of a mask, or all, start an episode: change to the tasks that are chosen for them.
-
-        Only while tasks may change; the host then waits for the device.
-        """
+        """Change to the tasks that are chosen for rows that start an episode; the host waits for the device."""
         if not self.tasks_change:
             return
         mask = torch.ones_like(self.task, dtype=torch.bool) if mask is None else mask
@@ -244,9 +238,7 @@ class Rows(TakesNumbers, nn.Module):
             self.episodes_left = torch.where(changed, 0, self.episodes_left)
 
     def set_goals(self, goals: Iterable[Sequence[int]] | Tensor) -> None:
-        """Give every row a goal at any time, in the middle of an episode too; the tree and all else stay.
-
-        ``goal_leaf`` changes and ``tasks`` does not: `set_tasks` and `set_seed` go back to the tasks' own goals.
+        """Give every row a goal, in the middle of an episode too; `set_tasks` and `set_seed` restore the tasks' goals.
 
         Args:
             goals: for every row its decisions in 1..b, also as [N, d]; or the numbers of end states, int64 [N].

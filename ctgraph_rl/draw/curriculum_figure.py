@@ -6,13 +6,13 @@ The panels leave wait states out: there is one before each decision and end stat
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from ctgraph_rl.core.graph import CTGraph, StateType
-from ctgraph_rl.draw.layout import MOST_PATHS, Layout, in_digits, lay_out
+from ctgraph_rl.core.graph import CTGraph
+from ctgraph_rl.draw.layout import MOST_PATHS, in_digits, lay_out
 from ctgraph_rl.draw.style import (
     PlanePoint,
     draw_lines,
@@ -87,8 +87,20 @@ def _draw_panel(axes: Any, graph: CTGraph, goals: Mapping[Goal, str]) -> None:
     shown = [end for end in layout.leaves if end in labels]
     places = {node: (x, -float(layout.level[node])) for node, x in layout.x.items()}
     level = len(layout.leaves) <= MOST_LEVEL
-    _draw_edges(axes, layout, places, shown)
-    _draw_states(axes, layout, places, shown)
+    on_path = set(chain.from_iterable(map(graph.nodes_to, shown)))
+    plain = stub_lines(layout, places, 0.45)
+    to_goals: list[list[PlanePoint]] = []
+    for node, place in places.items():
+        if node:
+            lines = to_goals if node in on_path else plain
+            lines.append([places[graph.parent(node)], place])
+    draw_lines(axes, plain, colors="0.6", linewidths=0.8)
+    draw_lines(axes, to_goals, linewidths=1.6)
+    size = max(3.0, 9.0 - len(layout.leaves) / 6 - graph.depth / 4)
+    star = goal_mark(max(2 * size, 9))
+    for node, place in places.items():
+        style = star if node in shown else mark(layout.kind(node), size)
+        axes.plot(*place, zorder=3, clip_on=False, **style)
     for end in shown:  # labels stand upright where there is little room
         words = labels[end] if level else labels[end].replace("\n", "  ")
         axes.annotate(
@@ -107,28 +119,3 @@ def _draw_panel(axes: Any, graph: CTGraph, goals: Mapping[Goal, str]) -> None:
     room = (0.16 if level else 0.32) * graph.depth + 0.2  # for labels, in decisions
     axes.set(xlim=(-0.02, 1.02), ylim=(-graph.depth - room, 0.3))
     axes.axis("off")
-
-
-def _draw_edges(axes: Any, layout: Layout, places: Mapping[int, PlanePoint], goals: Iterable[int]) -> None:
-    graph = layout.graph
-    on_path = set(chain.from_iterable(map(graph.nodes_to, goals)))
-    plain = stub_lines(layout, places, 0.45)
-    thick: list[list[PlanePoint]] = []
-    for node, place in places.items():
-        if node:
-            (thick if node in on_path else plain).append([places[graph.parent(node)], place])
-    draw_lines(axes, plain, colors="0.6", linewidths=0.8)
-    draw_lines(axes, thick, linewidths=1.6)
-
-
-def _draw_states(axes: Any, layout: Layout, places: Mapping[int, PlanePoint], goals: Iterable[int]) -> None:
-    size = max(3.0, 9.0 - len(layout.leaves) / 6 - layout.graph.depth / 4)
-    ends = set(layout.leaves)
-    stars = set(goals)
-    for points, style in (
-        ([place for node, place in places.items() if node not in ends], mark(StateType.DECISION, size)),
-        ([places[end] for end in ends - stars], mark(StateType.END, size)),
-        ([places[goal] for goal in stars], goal_mark(max(2 * size, 9))),
-    ):
-        if points:
-            axes.plot(*zip(*points, strict=True), zorder=3, clip_on=False, **style)

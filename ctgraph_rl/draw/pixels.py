@@ -65,11 +65,10 @@ def render(
 ) -> Tensor:
     """Draw every row: its observation and its tree with the goal and the current position.
 
-    The goal has a star below it; the way so far is a thick dark line, and the current state has a black outline. On
-    failure the outline is around the fail mark, top right, and a cross is where it happened: at a decision state, which
-    stands for the wait state before it too, or at the wait state before an end. Of a tree too large for the width only
-    the paths to the current node and to the goal are drawn, with stubs for other branches. A small cross marks
-    a decision state with swapped branches.
+    A star is below the goal, a thick dark line is the way so far, and the current state has a black outline. On failure
+    the outline is around the fail mark, top right, and a cross is where it happened: at a decision state, also for the
+    wait state before it, or at the wait state before an end. Of a tree too large for the width only the paths to the
+    current node and to the goal are drawn, with stubs for other branches. A small cross marks swapped branches.
 
     Args:
         tasks: the rows' tasks, N in all.

@@ -65,9 +65,9 @@ def draw_task(
 ) -> None:
     """Draw a task's graph: every state in the colour and shape of its kind, and a star at the goal.
 
-    Wait states that may be stayed in have a loop, and dashed arrows are the actions that fail. In the nodes stand the
-    ids of their observations, the first and the last where one is drawn each time. Of a tree with more than 32 end
-    states the path to the goal is drawn, and those to the end states visited most.
+    Wait states that may be stayed in have a loop, and dashed arrows are the actions that fail. Nodes hold the ids of
+    their observations, the first and the last where one is drawn. Of a tree with more than 32 end states only the paths
+    to the goal and to the end states visited most are drawn.
 
     States are keys (state type, node), as ``env.state_type`` and ``env.node`` give them; home and fail have node 0.
     What is not in a mapping is not drawn.
@@ -75,10 +75,10 @@ def draw_task(
     Args:
         axes: matplotlib axes, of their size when the picture is made.
         task: any task.
-        visits: how often each state was visited: the numbers stand in the nodes instead of ids, and edges are as wide
-            as they were used. `ctgraph_rl.play.visits.visits` counts.
-        policy: b + 1 action probabilities for each state, or the number of its greedy action: edges have the numbers,
-            and the likeliest action is black.
+        visits: how often each state was visited, as `ctgraph_rl.play.visits.visits` counts: numbers in the nodes
+            instead of ids, and the width of edges.
+        policy: b + 1 action probabilities of each state, or its greedy action: numbers at edges, and the likeliest
+            action is black.
         values: b + 1 numbers for each state, such as Q-values, which stand at the edges.
         ids: observation ids in the nodes; False: the initials of the kinds.
         legend: name shapes and colours below the tree.

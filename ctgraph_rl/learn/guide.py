@@ -26,9 +26,9 @@ def guided_share(frames: int, guide_frames: int) -> float:
 class Guide:
     """A policy in whose place `NavigationPolicy` acts through a share of the episodes.
 
-    The agent learns from these actions as from its own: the policy writes all else, such as the probability that it
-    would have taken them with. Draws come from torch's global generator, and none are made once the share is 0. The
-    data carries under ``guided`` which rows are in such an episode, bool [num_envs].
+    The agent learns from these actions as from its own: the policy writes all else, such as their probability. Draws
+    come from torch's global generator, and stop once the share is 0. ``guided``, bool [num_envs], says which rows are
+    in such an episode.
 
     Args:
         policy: of the agent.

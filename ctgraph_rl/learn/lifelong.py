@@ -33,9 +33,9 @@ def learn_curriculum(
     """Let an agent learn a curriculum block by block, evaluated as the curriculum says.
 
     The environment draws from streams of ``seed``, the agent from torch's global generator, which the caller seeds.
-    Evaluation disturbs neither. Where boundaries are announced, a batch ends with its block; where they are hidden, a
-    batch may hold frames of two blocks. Where an environment cannot be saved within an episode, ``checkpoint`` is
-    offered the state at announced boundaries only.
+    Evaluation disturbs neither. A batch ends with its block where boundaries are announced, and may hold frames of two
+    where they are hidden. An environment that cannot be saved within an episode offers its state to ``checkpoint`` at
+    announced boundaries only.
 
     Args:
         curriculum: what to learn.
@@ -44,8 +44,8 @@ def learn_curriculum(
         log: where measurements are appended; default: a new one in memory.
         progress: is updated after every batch; True: a bar on a terminal and in a notebook, lines elsewhere.
         device: where the environment lives.
-        saved: a state that ``checkpoint`` was given, to resume from with the same bits as if the run had never stopped.
-            The agent is built as it was, and the log holds what it held then.
+        saved: a state that ``checkpoint`` was given, to resume from with the same bits. The agent is built as it was,
+            and the log holds what it held then.
         checkpoint: is offered the state after every batch.
 
     Returns:

@@ -21,10 +21,9 @@ from ctgraph_rl.learn.collect import Policy, Step
 class LogitsPolicy:
     """A plain module that maps observations to logits, as a policy: greedy, or sampling where exploration is on.
 
-    The module is given observations with the values that the environment shows, 0 to 255 for images, in the type and on
-    the device of its first parameter: it scales and flattens them itself. It acts in evaluation mode, without dropout,
-    and is left in the mode that it had. Where the protocol shows task ids and its ``forward`` needs two arguments, or
-    names the second one ``task_id``, the one-hot task ids are the second.
+    The module gets observations as the environment shows them, 0 to 255 for images, in the type and on the device of
+    its first parameter. It acts in evaluation mode. Where the protocol shows task ids and its ``forward`` needs two
+    arguments, or names the second one ``task_id``, the one-hot task ids are the second.
 
     Args:
         module: maps float [n, 1, r, r] or [n, K] to float [n, num_actions].
@@ -95,7 +94,7 @@ def positional_parameters(function: Any) -> list[Parameter]:
 
 @contextmanager
 def _evaluation_mode(module: nn.Module) -> Iterator[None]:
-    """Let a module compute without dropout and without a change of its running means; its mode is restored."""
+    """Let a module compute in evaluation mode, then restore its mode."""
     training = [each for each in module.modules() if each.training]
     module.eval()
     try:

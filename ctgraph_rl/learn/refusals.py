@@ -14,7 +14,6 @@ from ctgraph_rl.core.rewards import KERNEL_REWARDS
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.exact import exact_rules
 from ctgraph_rl.tasks.curriculum import Curriculum
-from ctgraph_rl.tasks.protocol import Block
 from ctgraph_rl.tasks.task import Task
 
 
@@ -96,7 +95,10 @@ def check_adaptation(curriculum: Curriculum, agent: Agent) -> None:
     name = type(agent).__name__
     how = curriculum.evaluation
     row = f"rows of an evaluation have {how.row_episodes} episodes, and {name} adapts after {needed}"
-    without = [str(number) for number, block in enumerate(curriculum.blocks, 1) if not _has_distribution(block)]
+    without = []
+    for number, block in enumerate(curriculum.blocks, 1):
+        if len(set(block.tasks)) == 1 and getattr(block.tasks[0], "goal_change", None) is None:
+            without.append(str(number))
     one = f"{name} learns to adapt to tasks that are drawn, and block {', '.join(without)} has one task"
     steps = _steps_of_trial(curriculum, agent)
     trial = f"a trial of {getattr(agent, 'trial_episodes', 0)} episodes that reach an end takes {steps} steps"
@@ -117,10 +119,6 @@ def _steps_of_trial(curriculum: Curriculum, agent: Agent) -> int:
         return 0
     lengths = [task.graph.expected_episode_length for task in curriculum.tasks if isinstance(task, Task)]
     return math.ceil(agent.trial_episodes * max(lengths, default=0))  # type: ignore[attr-defined]
-
-
-def _has_distribution(block: Block) -> bool:
-    return len(set(block.tasks)) > 1 or getattr(block.tasks[0], "goal_change", None) is not None
 
 
 def notes(curriculum: Curriculum) -> Iterator[str]:

@@ -43,9 +43,8 @@ def learn_together(
 ) -> dict[int, FloatingPointError]:
     """Let agents with different seeds learn a curriculum as `learn_curriculum` lets one.
 
-    Each seed has the rows of the environment, the generator, the evaluations and the log of a single run; no seed's
-    numbers depend on another's data. Losses and actions differ from those of a single run by rounding. A seed with a
-    loss or weight that is not finite has failed: it measures nothing from then on, and the others learn on as ever.
+    Each seed has the rows, generator, evaluations and log of a single run, and differs from it by rounding alone. A
+    seed with a loss or weight that is not finite has failed: it measures nothing from then on; the others learn on.
 
     Args:
         curriculum: what to learn; `why_not_together` has no objection.
@@ -54,8 +53,7 @@ def learn_together(
         logs: where the measurements of each are appended.
         progress: is updated after every batch with the mean return of all seeds.
         device: where the environment lives.
-        saved: the states of all seeds, as ``checkpoint`` was given them, to resume from with the same bits as if the
-            group had never stopped.
+        saved: the states of all seeds that ``checkpoint`` was given, to resume from with the same bits.
         checkpoint: is offered the states after every batch.
 
     Returns:

@@ -14,8 +14,8 @@ from helpers.task_families import SWITCHED, VECTORS, calls, read, seen
 from torch import Tensor
 
 from ctgraph_rl import CTGraphEnv, Steps, rollout
-from ctgraph_rl.batch.draw_ahead import MAX_TICKS, MAX_WORDS
 from ctgraph_rl.batch.rows import Rows
+from ctgraph_rl.batch.tensor_engine import MAX_TICKS, MAX_WORDS
 from ctgraph_rl.core import dynamics
 
 NOISY = replace(confounding(p=0.5, read_rotation=5), reward_std=0.3, goal_change=(1, 3), step_reward=0.5)
@@ -57,7 +57,7 @@ def test_draws_ahead_are_those_of_the_bare_core_through_hundreds_of_steps_with_r
 
 @pytest.mark.parametrize("room", [0, 5, 6, 12, 6 * MAX_TICKS + 5])
 def test_any_number_of_draws_ahead_gives_the_same_draws(monkeypatch, room):
-    monkeypatch.setattr("ctgraph_rl.batch.draw_ahead.MAX_WORDS", room)
+    monkeypatch.setattr("ctgraph_rl.batch.tensor_engine.MAX_WORDS", room)
     rows, twin = (tensor_rows(TASKS, seed=4) for _ in range(2))
 
     play(rows, twin, calls(30, 6, seed=room))

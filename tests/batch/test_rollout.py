@@ -12,7 +12,7 @@ from helpers.task_families import FAMILIES, MIXED
 from torchrl.envs import StepCounter, TransformedEnv
 
 from ctgraph_rl import CTGraphEnv, Rows, Steps, Task, rollout
-from ctgraph_rl.batch.draw_ahead import MAX_TICKS
+from ctgraph_rl.batch.tensor_engine import MAX_TICKS
 from ctgraph_rl.core import philox
 
 ENGINES = ("off", "required")
