@@ -43,7 +43,7 @@ def learn_together(
 ) -> dict[int, FloatingPointError]:
     """Let agents with different seeds learn a curriculum as `learn_curriculum` lets one.
 
-    Each seed has the rows, generator, evaluations and log of a single run, and differs from it by rounding alone. A
+    Each seed has the rows, generator, evaluations and log of a single run and differs from it by rounding. A
     seed with a loss or weight that is not finite has failed: it measures nothing from then on; the others learn on.
 
     Args:
