@@ -177,20 +177,14 @@ def open_own(path: Path, mode: str) -> BinaryIO:
     """
     require_no_link(path)
     rule = f"{path} must be a regular file without another name, as hard links are; remove it"
-    require((_is_regular_or_missing(path), rule))
+    with suppress(FileNotFoundError):  # one look, as another process may remove it at any time
+        require((stat.S_ISREG(path.lstat().st_mode), rule))
     opener = _opener(os.O_NOFOLLOW | os.O_NONBLOCK)
     file: BinaryIO = open(path, mode, 0, opener=opener)  # type: ignore[assignment] # noqa: SIM115 - it is returned
     if os.fstat(file.fileno()).st_nlink > 1:
         file.close()
         raise ValueError(rule)
     return file
-
-
-def _is_regular_or_missing(path: Path) -> bool:
-    try:
-        return stat.S_ISREG(path.lstat().st_mode)
-    except FileNotFoundError:
-        return True
 
 
 def _opener(more: int) -> Callable[[str, int], int]:

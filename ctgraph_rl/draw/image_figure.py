@@ -92,7 +92,11 @@ def _reads(task: Task, shown: list[tuple[StateType, int]], count: int, seed: int
     rows: list[Task] = []
     kinds: list[int] = []
     for kind, number in shown:
-        rows += [_pin(task, kind, number)] * count
+        name = kind.name.lower()
+        changes: dict[str, Any] = {f"{name}_ids": (number, number)}
+        if task.observations.is_unique(kind):
+            changes[f"unique_{name}s"] = False
+        rows += [replace(task, observations=replace(task.observations, **changes))] * count
         kinds += [kind] * count
     batch = Rows(rows, seed)
     batch.reset()
@@ -101,14 +105,6 @@ def _reads(task: Task, shown: list[tuple[StateType, int]], count: int, seed: int
     node = torch.where(state_type == StateType.END, task.graph.num_decision_states, 0)
     batch.state = state._replace(state_type=state_type, node=node)
     return batch.show().observation.unflatten(0, (len(shown), count))
-
-
-def _pin(task: Task, kind: StateType, number: int) -> Task:
-    name = kind.name.lower()
-    changes: dict[str, Any] = {f"{name}_ids": (number, number)}
-    if task.observations.is_unique(kind):
-        changes[f"unique_{name}s"] = False
-    return replace(task, observations=replace(task.observations, **changes))
 
 
 def _draw_line(axes: Any, row: int, line: ImageLine, white: float) -> None:

@@ -254,7 +254,18 @@ class Lockstep:
                 self.group.start_task(announced_id(self.curriculum, segment.blocks[0]))
                 saved = None
             restore = None if saved is None else partial(self._restore, saved)
-            for batch, carried in self._collect(segment, restore):
+            batches = collect_segment(
+                segment,
+                self.env,
+                self.group.agents[0],
+                self._evaluate,
+                policy=self.group.policy,
+                done=self.frames - segment.start,
+                restore=restore,
+                num_seeds=len(self.logs),
+                guide_frames=self.curriculum.protocol.guide_frames,
+            )
+            for batch, carried in batches:
                 self._carried = carried
                 self._learn(batch, segment)
                 self.can_resume = resumes(self.curriculum) or self.frames == segment.end
@@ -263,21 +274,6 @@ class Lockstep:
                 yield True
             self.group.end_task()
             self._evaluate(self.frames)
-
-    def _collect(
-        self, segment: Segment, restore: Callable[[], TensorDictBase] | None
-    ) -> Iterator[tuple[TensorDictBase, TensorDictBase]]:
-        return collect_segment(
-            segment,
-            self.env,
-            self.group.agents[0],
-            self._evaluate,
-            policy=self.group.policy,
-            done=self.frames - segment.start,
-            restore=restore,
-            num_seeds=len(self.logs),
-            guide_frames=self.curriculum.protocol.guide_frames,
-        )
 
     def _evaluate(self, frames: int) -> None:
         """Evaluate those that have not failed, where the curriculum evaluates after ``frames`` frames."""

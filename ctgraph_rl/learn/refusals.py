@@ -100,7 +100,10 @@ def check_adaptation(curriculum: Curriculum, agent: Agent) -> None:
         if len(set(block.tasks)) == 1 and getattr(block.tasks[0], "goal_change", None) is None:
             without.append(str(number))
     one = f"{name} learns to adapt to tasks that are drawn, and block {', '.join(without)} has one task"
-    steps = _steps_of_trial(curriculum, agent)
+    steps = 0
+    if getattr(agent, "needs_whole_trials", False):
+        lengths = [task.graph.expected_episode_length for task in curriculum.tasks if isinstance(task, Task)]
+        steps = math.ceil(agent.trial_episodes * max(lengths, default=0))  # type: ignore[attr-defined]
     trial = f"a trial of {getattr(agent, 'trial_episodes', 0)} episodes that reach an end takes {steps} steps"
     cut = f"num_steps={agent.num_steps} of {name}: {trial}, and {name} learns from whole trials in a batch"
     require(
@@ -108,17 +111,6 @@ def check_adaptation(curriculum: Curriculum, agent: Agent) -> None:
         (not without, f"{one}: give a block all goals, as nm_uniform_goals does, or its task a goal_change"),
         (how.row_episodes > needed, f"{row}: set evaluation.adapt_episodes={needed}"),
     )
-
-
-def _steps_of_trial(curriculum: Curriculum, agent: Agent) -> int:
-    """Return the mean steps of a trial whose episodes reach an end, of the CT-graph with the longest ones.
-
-    It is 0 for an agent that needs no whole trial.
-    """
-    if not getattr(agent, "needs_whole_trials", False):
-        return 0
-    lengths = [task.graph.expected_episode_length for task in curriculum.tasks if isinstance(task, Task)]
-    return math.ceil(agent.trial_episodes * max(lengths, default=0))  # type: ignore[attr-defined]
 
 
 def notes(curriculum: Curriculum) -> Iterator[str]:

@@ -6,7 +6,6 @@ import io
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from ctgraph_rl.checks import at_least_one, positive, require
 from ctgraph_rl.disk import write_named
@@ -35,21 +34,16 @@ def save_gif(player: Player, path: Path | str, seconds: float = 0.6, size: int =
         from PIL import Image
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError("GIFs need pillow: pip install 'ctgraph_rl[plot]'") from error
-    first, *others = [Image.fromarray(frame.numpy()) for frame in _frames(player, size, most_frames)]
-    stay = [round(1000 * seconds)] * len(others) + [round(1000 * seconds * LAST)]
-    buffer = io.BytesIO()
-    first.save(buffer, "GIF", save_all=True, append_images=others, duration=stay, loop=0)
-    write_named(path, buffer.getvalue())
-
-
-def _frames(player: Player, size: int, most: int) -> list[Tensor]:
-    """The pictures of an episode, uint8 [size, 2 * size, 3]; torch's global generator is left as it was found."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(player.seed)
         player.start()
         frames = [player.env.render(size)[0]]
         over = False
-        while not over and len(frames) < most:
+        while not over and len(frames) < most_frames:
             over = player.step()
             frames.append(player.env.render(size)[0])
-    return frames
+    first, *others = [Image.fromarray(frame.numpy()) for frame in frames]
+    stay = [round(1000 * seconds)] * len(others) + [round(1000 * seconds * LAST)]
+    buffer = io.BytesIO()
+    first.save(buffer, "GIF", save_all=True, append_images=others, duration=stay, loop=0)
+    write_named(path, buffer.getvalue())

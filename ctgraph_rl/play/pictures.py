@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from typing import Any
 
 from ctgraph_rl import parsers
 from ctgraph_rl.checks import at_least_one, require
@@ -36,20 +35,18 @@ def _write(selection: Selection, arguments: argparse.Namespace) -> None:
     film = arguments.gif is None or selection.policy is not None, "a film needs a policy: name a --policy or a --run"
     require(film, *at_least_one(dpi=arguments.dpi, episodes=arguments.episodes))
     if arguments.figure is not None:
-        save_figure(_figure(selection, arguments), arguments.figure, arguments.dpi)
+        if arguments.show == "images":
+            figure = image_figure(selection.task, arguments.seed)
+        elif selection.policy is None:
+            figure = task_figure(selection.task, ids=arguments.show == "ids")
+        else:
+            seen = selection.visits(arguments.episodes, arguments.seed, not arguments.sampled)
+            figure = task_figure(selection.task, visits=seen.counts, policy=seen.actions)
+        save_figure(figure, arguments.figure, arguments.dpi)
     if arguments.dot is not None:
         write_named(arguments.dot, to_dot(selection.task, selection.name))
     if arguments.gif is not None:
         save_gif(selection.player(arguments.seed, not arguments.sampled), arguments.gif)
-
-
-def _figure(selection: Selection, arguments: argparse.Namespace) -> Any:
-    if arguments.show == "images":
-        return image_figure(selection.task, arguments.seed)
-    if selection.policy is None:
-        return task_figure(selection.task, ids=arguments.show == "ids")
-    seen = selection.visits(arguments.episodes, arguments.seed, not arguments.sampled)
-    return task_figure(selection.task, visits=seen.counts, policy=seen.actions)
 
 
 if __name__ == "__main__":
