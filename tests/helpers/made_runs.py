@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ctgraph_rl import RunLog, metrics
+from ctgraph_rl.log.provenance import NUMBERS
 from ctgraph_rl.log.run_log import write_metrics, write_performance
 from ctgraph_rl.runs.read import find_runs
 
@@ -43,7 +44,7 @@ def write_run(
     trained = [(task,) for task in range(len(labels))]
     log = RunLog(path / "run.jsonl")
     about = {"schema": 1, "curriculum": curriculum[0], "fingerprint": curriculum[1], "version": 1, "source": "a test"}
-    system = {"versions": {"ctgraph_rl": "0.1.0"}, "machine": "x86_64", "num_threads": 1}
+    system = {"versions": {"ctgraph_rl": "0.1.0"}, "numbers": NUMBERS, "machine": "x86_64", "num_threads": 1}
     config = {"agent": {"_target_": f"baselines.made.{agent}", "gamma": 0.9}, "seed": seed, "device": "cpu"}
     numbers = [[task + 1 for task in block] for block in trained]
     log.append("run", **about, **system, tasks=list(labels), trained=numbers, config=config)
