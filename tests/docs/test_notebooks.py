@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -88,6 +89,37 @@ def test_a_learner_of_ones_own_learns_forgets_and_transfers_as_its_notebook_says
     assert abs(settled - (0.8 + 0.2 / 3) ** 5) < 0.05
 
 
+def forgets_and_keeps(names: dict[str, Any]) -> None:
+    """Fine-tuned PPO knows the task of the last block alone, and PPO with EWC all so far."""
+    assert names["matrix"].tolist() == [[0] * 4, *np.eye(4).tolist()]
+    assert names["kept"].tolist() == np.tri(5, 4, -1).tolist()
+    assert names["by_hand"] == names["metrics"]["forgetting"].value == 1
+
+
+@pytest.mark.slow
+def test_the_notebook_on_forgetting_finds_what_it_says_with_pictures(tmp_path, monkeypatch):
+    names, prose = run("forgetting.ipynb", tmp_path, monkeypatch)
+
+    says(prose, "task 1 is at 0: it forgot", "With EWC each column stays at 1 once its task is learned")
+    forgets_and_keeps(names)
+
+
+@pytest.mark.slow
+def test_the_notebook_on_forgetting_runs_without_matplotlib_and_its_solution_is_the_ceiling(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
+    path, names = FOLDER / "forgetting.ipynb", {"__name__": "__main__"}
+    [solution] = re.findall(r"```python\n(.*?)```", "".join(sources(path, "markdown")), re.DOTALL)
+
+    exec("\n\n".join([*sources(path, "code"), solution]), names)
+
+    assert names["plt"] is None
+    forgets_and_keeps(names)
+    tasks = names["curriculum"].tasks
+    assert sum(task.memoryless_ceiling(deterministic=True) for task in tasks) / len(tasks) == 0.5
+    assert names["log"].performance()[-1].tolist() == [1, 0, 0, 1]
+    assert capsys.readouterr().out.endswith("average performance: 0.5\n")
+
+
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
 def test_what_a_notebook_stores_is_whole_small_and_of_no_machine(path):
     notebook = json.loads(path.read_text(encoding="utf-8"))
@@ -105,10 +137,10 @@ def test_what_a_notebook_stores_is_whole_small_and_of_no_machine(path):
     assert counts == list(range(1, len(counts) + 1))
 
 
-def test_there_are_two_notebooks_and_each_ends_with_what_to_read_next():
+def test_there_are_three_notebooks_and_each_ends_with_what_to_read_next():
     links = {path.name: re.findall(r"\]\(([^)#]+)\)", sources(path, "markdown")[-1]) for path in NOTEBOOKS}
 
-    assert list(links) == ["environment.ipynb", "own_learner.ipynb"]
+    assert list(links) == ["environment.ipynb", "forgetting.ipynb", "own_learner.ipynb"]
     for found in links.values():
         assert found
         assert [link for link in found if not (FOLDER / link).is_file()] == []
