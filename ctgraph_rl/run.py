@@ -33,11 +33,11 @@ from ctgraph_rl.runs.config import (
     check_one_cell,
     check_resolved,
     composed,
-    explain,
     in_sweep,
     of_hydra,
     register_run_name,
 )
+from ctgraph_rl.runs.explain import explain
 from ctgraph_rl.runs.settings import in_digits, names_in
 from ctgraph_rl.runs.sweep import Sweeper, sweepable
 

@@ -64,6 +64,7 @@ KNOW_HYDRA = (
     "ctgraph_rl.run",
     "ctgraph_rl.runner",
     "ctgraph_rl.runs.config",
+    "ctgraph_rl.runs.explain",
     "ctgraph_rl.runs.job",
     "ctgraph_rl.runs.on_dask",
     "ctgraph_rl.runs.sweep",

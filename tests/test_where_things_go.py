@@ -23,6 +23,7 @@ from ctgraph_rl.report import formats
 from ctgraph_rl.report.results import Row
 from ctgraph_rl.report.statistics import Estimate
 from ctgraph_rl.runs import config
+from ctgraph_rl.runs.explain import LAUNCHERS, explain
 from ctgraph_rl.runs.job import with_changes
 from ctgraph_rl.runs.train import new_agent
 from ctgraph_rl.tasks import protocol
@@ -157,12 +158,12 @@ def test_a_coupling_is_a_class():
 
 
 def test_a_launcher_is_named_with_its_extra(compose, monkeypatch):
-    monkeypatch.setitem(config.LAUNCHERS, "hydra/launcher/grid", "grid")
+    monkeypatch.setitem(LAUNCHERS, "hydra/launcher/grid", "grid")
 
     with pytest.raises(Exception) as refused:
         compose("hydra/launcher=grid", return_hydra_config=True)
 
-    assert "pip install 'ctgraph_rl[grid]'" in config.explain(refused.value)
+    assert "pip install 'ctgraph_rl[grid]'" in explain(refused.value)
 
 
 def test_a_boundary_is_a_name_and_a_property(monkeypatch):

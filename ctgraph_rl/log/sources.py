@@ -38,9 +38,6 @@ SCRIPT = "__main__"
 SCRIPTS = (SCRIPT, "__mp_main__")
 """The script that runs, and its name in processes that ``multiprocessing`` starts."""
 
-NOT_CODE = ("kind", "type_comment", "type_ignores")
-"""Fields of syntax nodes that change nothing; ``kind`` is the u of a text."""
-
 
 class Module(NamedTuple):
     """A module of the user."""
@@ -153,13 +150,13 @@ def read_module(name: str, source: bytes, is_package: bool = False) -> Module:
         source: its file; one that is no Python of this version counts byte by byte.
         is_package: whether it is the ``__init__`` of a package.
     """
+    package = name if is_package else name.rpartition(".")[0]
     try:
         tree = ast.parse(source)
-        digest = _hash(syntax(tree))
+        imports = frozenset(_imports(tree, package))
+        return Module(_hash(code_text(tree)), imports)
     except (SyntaxError, ValueError, RecursionError, MemoryError):
-        return Module(_hash([source.hex()]), frozenset())
-    package = name if is_package else name.rpartition(".")[0]
-    return Module(digest, frozenset(_imports(tree, package)))
+        return Module(_hash(source.hex()), frozenset())
 
 
 def _of_script(name: str) -> Module | None:
@@ -172,7 +169,8 @@ def _of_script(name: str) -> Module | None:
     tree.body = _needed(tree.body, name)
     if not tree.body:
         return None
-    return Module(_hash(syntax(tree)), frozenset(_imports(tree, package)))
+    imports = frozenset(_imports(tree, package))
+    return Module(_hash(code_text(tree)), imports)
 
 
 def _needed(statements: Iterable[ast.stmt], name: str) -> list[ast.stmt]:
@@ -232,59 +230,23 @@ def _imports(tree: ast.AST, package: str) -> Iterator[str]:
                     yield f"{package}{each.value}" if each.value.startswith(".") else each.value
 
 
-def syntax(tree: ast.AST) -> Iterator[str]:
-    """Yield the syntax of a tree as texts: kinds of nodes and their fields, without positions and docstrings.
-
-    What depends on the version of Python is left out: empty fields, and how the text of an f-string is cut into parts.
-    """
-    waiting: list[Any] = [tree]
-    while waiting:
-        part = waiting.pop()
-        if isinstance(part, ast.AST):
-            fields = {name: value for name, value in ast.iter_fields(part) if name not in NOT_CODE}
-            if isinstance(part, ast.JoinedStr):
-                fields["values"] = list(_joined(part.values))
-            named: list[Any] = []
-            for name in sorted(fields):
-                named += _field(name, fields[name])
-            waiting += [_Text(")"), *reversed(named), _Text(f"{type(part).__name__}(")]
-        elif isinstance(part, list):
-            waiting += [_Text("]"), *reversed(part), _Text("[")]
-        else:
-            yield part if isinstance(part, _Text) else ascii(part)
+def code_text(tree: ast.AST) -> str:
+    """Return the code of a syntax tree, which it changes: without comments, layout and statements that do nothing."""
+    for node in ast.walk(tree):
+        for name in ("body", "orelse", "finalbody"):
+            statements = getattr(node, name, None)
+            if isinstance(statements, list):
+                setattr(node, name, [each for each in statements if not _has_no_effect(each)])
+    return ast.unparse(tree)
 
 
-def _joined(parts: Iterable[ast.expr]) -> Iterator[Any]:
-    """Yield the parts of an f-string, with adjacent texts as one, and no empty ones."""
-    text = ""
-    for part in parts:
-        if isinstance(part, ast.Constant):
-            text += str(part.value)
-            continue
-        yield from filter(None, [text])
-        yield part
-        text = ""
-    yield from filter(None, [text])
-
-
-class _Text(str):
-    """A text that is no value of the syntax."""
-
-
-def _field(name: str, value: Any) -> list[Any]:
-    """Return a field with its name; nothing for an empty one."""
-    if isinstance(value, list):
-        value = [each for each in value if not _has_no_effect(each)]
-    return [] if value is None or value == [] else [_Text(f"{name}="), value]
-
-
-def _has_no_effect(node: Any) -> bool:
+def _has_no_effect(node: ast.AST) -> bool:
     """Return whether a statement does nothing, as docstrings do."""
     return isinstance(node, ast.Pass) or (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant))
 
 
-def _hash(texts: Iterable[str]) -> str:
-    return hashlib.sha256("\n".join(texts).encode("utf-8", "surrogatepass")).hexdigest()[:16]
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode("ascii", "backslashreplace")).hexdigest()[:16]
 
 
 def targets(settings: Any) -> Iterator[str]:

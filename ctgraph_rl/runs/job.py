@@ -31,6 +31,7 @@ from ctgraph_rl.portable import hold
 from ctgraph_rl.runs import config
 from ctgraph_rl.runs.checkpoints import Checkpoints
 from ctgraph_rl.runs.experts import Expert, RunDirs, expert_curriculum, find_or_train, is_of_group
+from ctgraph_rl.runs.explain import explain
 from ctgraph_rl.runs.interrupt import Interrupt
 from ctgraph_rl.runs.session import (
     START_AGAIN,
@@ -427,7 +428,7 @@ def run_seeds(cfg: Any, run_dir: Path) -> list[Path]:
         try:
             run_job(each, folder, None if number else first)
         except Exception as error:  # one that fails stops no other
-            errors.append(f"seed {each.seed}: {type(error).__name__}: {config.explain(error)}")
+            errors.append(f"seed {each.seed}: {type(error).__name__}: {explain(error)}")
     if errors:
         raise RuntimeError("; ".join(errors))
     return [folder for _, folder in cells]

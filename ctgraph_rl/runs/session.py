@@ -37,6 +37,7 @@ from ctgraph_rl.log.tables import write_tables
 from ctgraph_rl.packages import check_packages
 from ctgraph_rl.runs import config
 from ctgraph_rl.runs.checkpoints import Checkpoints, RunState, newest_of_all, offer_all
+from ctgraph_rl.runs.explain import explain
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.curriculum_json import file_text
 
@@ -349,7 +350,7 @@ def mark_failure(run_dir: Path) -> Iterator[None]:
     except Exception as error:
         if failed_before or (run_dir / LOG).exists() or config.in_sweep():
             with suppress(OSError):
-                write_whole(mark, f"{type(error).__name__}: {config.explain(error)}\n", synced=False)
+                write_whole(mark, f"{type(error).__name__}: {explain(error)}\n", synced=False)
         raise
 
 

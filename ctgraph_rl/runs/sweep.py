@@ -26,7 +26,8 @@ from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CHECKPOINTS, EX_TEMPFAIL, member_folder
 from ctgraph_rl.packages import check_packages, conf_dir
 from ctgraph_rl.portable import become_portable
-from ctgraph_rl.runs.config import check_overwrite, check_resolved, check_settings, explain, of_member, save_yaml
+from ctgraph_rl.runs.config import check_overwrite, check_resolved, check_settings, of_member, save_yaml
+from ctgraph_rl.runs.explain import explain
 from ctgraph_rl.runs.status import (
     DONE,
     IN_USE,

@@ -29,7 +29,7 @@ from rich.console import Console
 from ctgraph_rl.log.files import locked
 from ctgraph_rl.run import MOST_IN_TABLE, show_sweep
 from ctgraph_rl.runs import job
-from ctgraph_rl.runs.config import explain
+from ctgraph_rl.runs.explain import explain
 from ctgraph_rl.runs.status import SHOWN, RunOutcome, Status, SweepProgress, lock_holder, report, status_of
 from ctgraph_rl.runs.sweep import shortened, sigterm_exits, why
 
