@@ -1,6 +1,8 @@
 """README shows only what runs: CI executes its two commands, this test its Python."""
 
 import re
+import subprocess
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -45,6 +47,16 @@ def test_readme_is_short_and_counts_what_there_is():
     assert f"{len(metrics.definitions())} metrics, and runs" in text
 
 
+def stored_by(commit: str, path: Path) -> bytes | None:
+    """The content of a file at a commit; None where the history is not at hand."""
+    name = path.relative_to(CHECKOUT).as_posix()
+    try:
+        shown = subprocess.run(["git", "show", f"{commit}:{name}"], cwd=CHECKOUT, capture_output=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return shown.stdout
+
+
 def test_the_page_on_how_numbers_were_made_has_the_file_of_each_result_of_readme():
     folder = CHECKOUT / "docs" / "results"
     page = (folder / "how_made.md").read_text(encoding="utf-8")
@@ -54,8 +66,10 @@ def test_the_page_on_how_numbers_were_made_has_the_file_of_each_result_of_readme
     text = " ".join(README.read_text(encoding="utf-8").replace("**", "").split())
     results = text.split("## Results")[1].split("## More")[0]
     for file, _, commit, numbers in rows:
-        assert (folder / re.findall(r"\((.*?)\)", file)[0]).is_file()
         assert re.fullmatch(r"[0-9a-f]{8}", commit)
+        path = (folder / re.findall(r"\((.*?)\)", file)[0]).resolve()
+        stored = stored_by(commit, path)
+        assert stored is None or stored == path.read_bytes(), f"{commit} has another {path.name}"
         assert [each for each in numbers.split("; ") if each not in results and each != "the first figure"] == []
     said = {number for *_, numbers in rows for number in re.findall(r"\d+ of \d+", numbers)}
     assert {*re.findall(r"\d+ of \d+", results)} == said

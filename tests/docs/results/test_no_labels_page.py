@@ -161,7 +161,7 @@ def test_amd_finds_the_changed_transition_and_forgets_nothing(made):
         assert {line["delays"] for line in pair[name]} == {"6144"}  # to the end of the batch, at 57,344
         assert {(line["frames_rolled_back"], line["final_returns"]) for line in pair[name]} == {("49152.0", "0 0")}
     assert "one alarm in each of five seeds, 14,336 frames after the change" in PAGE
-    assert "so that all 49,152 frames that were learned from are undone" in PAGE
+    assert "which undoes all 49,152 frames that were learned from" in PAGE
 
 
 def test_with_longer_stays_all_detectors_keep_both_graphs_at_their_price(made):
