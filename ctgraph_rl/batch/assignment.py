@@ -17,7 +17,7 @@ from ctgraph_rl.tasks.task import Task
 
 
 def require_num_ids(task_ids: Mapping[Any, int] | None, num_task_ids: int | None) -> int:
-    """Return the length of ``task_id``, 0 for none; see `ctgraph_rl.CTGraphEnv` for the arguments and errors."""
+    """Return the length of ``task_id``, 0 for none; arguments and errors as in `ctgraph_rl.CTGraphEnv`."""
     if task_ids is None:
         require((num_task_ids is None, f"num_task_ids={num_task_ids!r} needs task_ids"))
         return 0
@@ -32,7 +32,7 @@ def require_num_ids(task_ids: Mapping[Any, int] | None, num_task_ids: int | None
 
 
 def one_hot_ids(ids: Tensor, length: int) -> Tensor:
-    """Return ids, int64 [N], as one-hot, uint8 [N, length]; zeros for -1."""
+    """Return ids, int64 [N], as one-hot uint8 [N, length]; zeros for -1."""
     return (ids.unsqueeze(-1) == torch.arange(length, device=ids.device)).to(torch.uint8)
 
 
@@ -40,7 +40,7 @@ def find_numbers(pool: Iterable[Task], tasks: Iterable[Task]) -> list[int]:
     """Return the numbers of tasks in a pool.
 
     Raises:
-        ValueError: for a task that is not in the pool.
+        ValueError: for a task that is not in it.
     """
     tasks = require_all(Task, "tasks", tasks)
     number = {task: i for i, task in enumerate(pool)}
@@ -50,7 +50,7 @@ def find_numbers(pool: Iterable[Task], tasks: Iterable[Task]) -> list[int]:
 
 
 def find_leaves(tasks: Sequence[Task], goals: Iterable[Sequence[int]]) -> list[int]:
-    """Return the numbers of the end states that goals, given by their decisions, are in tasks.
+    """Return the numbers of the end states that goals, sequences of decisions, lead to.
 
     Raises:
         ValueError: if there is not one goal per row, or a goal is no end state of its row's tree.
@@ -68,7 +68,7 @@ EpisodePlace = tuple[Tensor, Tensor, Tensor]
 
 
 class Assignment(NamedTuple):
-    """The task of each row, and the choices for its next episodes. Tasks are numbers in a pool, int64."""
+    """The task of each row, and the choices for its next episodes; tasks are numbers in a pool, int64."""
 
     task: Tensor  # [N]: the task that the row has
     choice: Tensor  # [N]: place of the task of its next episode among the choices
@@ -83,23 +83,23 @@ class Assignment(NamedTuple):
 
     @property
     def may_change(self) -> bool:
-        """Whether a row that starts an episode may change to another task."""
+        """Whether rows may change tasks when they start an episode."""
         return self.switch is not None or bool((self.task != self.chosen).any())
 
     @property
     def in_use(self) -> Tensor:
-        """The different tasks that rows have or may change to, ascending."""
+        """The tasks that rows have or may change to, ascending."""
         return torch.cat([self.task, self.chosen if self.switch is None else self.choices]).unique()
 
     def restarted(self) -> Assignment:
-        """Return the assignment before the first episodes with these choices; all rows have their task at once."""
+        """Return the assignment before the first episodes with these choices; rows get their tasks at once."""
         choice = self.choice if self.switch is None else torch.zeros_like(self.choice)
         return self._replace(
             task=self.choices.index_select(0, choice), choice=choice, episodes=torch.zeros_like(choice)
         )
 
     def begin(self, mask: Tensor, place: EpisodePlace) -> Assignment:
-        """Return the assignment of the rows when those of a mask, bool [N], start an episode."""
+        """Return the assignment when the rows of a mask, bool [N], start an episode."""
         following = self._replace(episodes=self.episodes + mask)
         if self.switch is not None:
             following = following._replace(choice=self._next_choice(self.switch, following.episodes, place))

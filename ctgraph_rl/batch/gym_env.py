@@ -28,27 +28,27 @@ from ctgraph_rl.tasks.kinds.task_like import close_env
 T = TypeVar("T")
 
 NUM_PROBED = 20
-"""Steps by which it is seen whether an environment repeats."""
+"""Steps of the test that an environment repeats."""
 
 
 class GymEnv(EnvBase):
-    """A batch of environments of Gymnasium, ``batch_size=[len(tasks)]``, stepped one after the other.
+    """Environments of Gymnasium, ``batch_size=[len(tasks)]``, stepped one after the other.
 
-    ``next`` shows the last observation of an episode. An episode that has ended by itself is ``terminated``, one that
-    the time limit ended ``truncated``. The observation keys are those of `TaskLike.make_env`. `close` closes the
-    environments, as many as rows; that of a row is closed where the row gets another task.
+    ``next`` shows the last observation of an episode. An episode that the time limit ended is ``truncated``, any other
+    ``terminated``. Observation keys are those of `TaskLike.make_env`. A row that gets another task closes its
+    environment; `close` closes all.
 
     Args:
         tasks: one for each row.
-        seed: decides the seed of every episode, in [0, 2**63).
+        seed: of all episodes, in [0, 2**63).
         task_pool: the tasks that `set_tasks` may be given. Default: ``tasks``.
-        device: where the tensors live.
-        task_ids: the id of each task, see `TaskLike.make_env`.
+        device: of the tensors.
+        task_ids: the id of each task, as in `TaskLike.make_env`.
         num_task_ids: length of ``task_id``; None: just enough.
 
     Raises:
-        ValueError: for tasks of different spaces, an environment that does not repeat with its seed, and one that
-            returns what its spaces do not hold.
+        ValueError: for tasks of different spaces, and an environment that does not repeat with its seed or leaves its
+            spaces.
         FloatingPointError: for an observation or a reward that is not finite; names environment, task and frame.
 
     Example:
@@ -108,7 +108,7 @@ class GymEnv(EnvBase):
         self._data = {**self.observation_spec.zero(), **self.full_done_spec.zero()}
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Close the environments of all rows; one that fails is named and does not keep others open."""
+        """Close the environments of all rows; one that fails is named and keeps no other open."""
         super().close(raise_if_closed=raise_if_closed)
         envs = self._envs
         self._envs = []
@@ -122,7 +122,7 @@ class GymEnv(EnvBase):
         """Give every row a task of the pool: before the next reset of all rows, or at the end of its episode.
 
         Raises:
-            ValueError: for another number of tasks than rows, and one that is not of the pool.
+            ValueError: if there is not one task per row, or a task is not in the pool.
         """
         tasks = require_all(GymTask, "tasks", tasks)
         unknown = [task for task in tasks if task not in self.pool]
@@ -198,7 +198,7 @@ class GymEnv(EnvBase):
         return self._shown(data).set("reward", reward)
 
     def _read(self, row: int, read: Callable[[Any], T], returned: Any) -> T:
-        """Return what an environment returned, read; say in errors where it was."""
+        """Read what an environment returned; errors name the place."""
         try:
             return read(returned)
         except (ValueError, FloatingPointError) as error:
@@ -240,7 +240,7 @@ class GymEnv(EnvBase):
         self._episode[:] = -1
 
     def state_dict(self, *args: Any, **kwargs: Any) -> NamedValues:
-        """Return what `load_state_dict` needs to continue: each row's task, episode and actions, and the shown data."""
+        """Return each row's task, episode and actions, and the shown data."""
         return {
             "tasks": self._numbers(self.tasks),
             "next_tasks": self._numbers(self._next),
@@ -257,7 +257,7 @@ class GymEnv(EnvBase):
         return tuple(self.pool[number] for number in numbers)
 
     def load_state_dict(self, state_dict: ReadOnlyValues, *args: Any, **kwargs: Any) -> None:
-        """Go back to a state: each row's episode begins with its seed, and its actions are taken again.
+        """Restore a state: each row's episode begins with its seed and repeats its actions.
 
         Raises:
             ValueError: if a row then does not show what it showed.
@@ -325,7 +325,7 @@ def _reset(env: Any, seed: int) -> Any:
 
 @cache
 def _repeats_rule(task: GymTask, key: Any) -> Rule:
-    """Return the rule that an episode repeats with its seed: in one environment, and in another."""
+    """Return the rule that an episode repeats with its seed, in one environment and in another."""
     if not task.repeats:
         return True, ""
     envs: list[Any] = []
@@ -344,7 +344,7 @@ def _play_probe(task: GymTask, env: Any) -> list[Any]:
     """Return what an episode of random actions shows.
 
     Raises:
-        ValueError: if it cannot be played, with the step.
+        ValueError: if a step fails; names it.
         FloatingPointError: for numbers that are not finite.
     """
     observed, _ = make_forms(task)

@@ -1,4 +1,4 @@
-"""Steps as a small C kernel, `kernel.c`: the bits of `dynamics` at the speed of memory, on CPUs."""
+"""The C kernel, `kernel.c`: the bits of `dynamics` at the speed of memory, on CPUs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ctgraph_rl.core.rewards import KERNEL_REWARDS, RewardFn
 from ctgraph_rl.core.row_params import RowParams
 
 KERNELS = ("auto", "off", "required")
-"""The values of ``kernel``, see `Rows`."""
+"""The values of ``kernel`` of `Rows`."""
 
 
 def kernel_rule(kernel: object) -> Rule:
@@ -27,15 +27,15 @@ def kernel_rule(kernel: object) -> Rule:
 
 
 def knows(reward_fns: Iterable[RewardFn], device: torch.device) -> bool:
-    """Return whether the kernel knows these rewards and runs on this device."""
+    """Return whether the kernel has these rewards and runs on this device."""
     return device.type == "cpu" and not _unknown(reward_fns)
 
 
 def require_kernel(reward_fns: Iterable[RewardFn], device: torch.device) -> None:
-    """Refuse what the kernel cannot run, and a machine that cannot compile it.
+    """Require that the kernel can run.
 
     Raises:
-        ValueError: saying which.
+        ValueError: for other rewards, another device or a machine that cannot compile it.
     """
     other = _unknown(reward_fns)
     names = ", ".join(reward.__name__ for reward in KERNEL_REWARDS)
@@ -52,7 +52,7 @@ def _unknown(reward_fns: Iterable[RewardFn]) -> list[RewardFn]:
 
 
 class Stepped(NamedTuple):
-    """What the rows show after a step, and what those show that then start an episode where one is over."""
+    """What the rows show after a step, and what finished ones show when they start an episode."""
 
     observation: Tensor  # uint8 [N, *shape]
     following: Tensor  # uint8 [N, *shape]: after the restarts
@@ -65,11 +65,11 @@ class Stepped(NamedTuple):
 
 
 Observed = tuple[Tensor, Tensor | None]
-"""What rows observe, uint8 [N, *shape], and which are done, bool [N]; None where none is."""
+"""What rows observe, uint8 [N, *shape], and which are done, bool [N]; None if none is."""
 
 
 class Native:
-    """Takes the steps of one batch by the kernel; a method returns the next states and what rows show.
+    """Takes the steps of a batch with the kernel; methods return the next states and what rows show.
 
     Bind parameters before the first step.
     """
@@ -78,7 +78,7 @@ class Native:
     tables: Tables
 
     def bind(self, params: RowParams, tables: Tables) -> None:
-        """Take the rows' parameters and those of their tasks."""
+        """Take the parameters of the rows and of their tasks."""
         self.params = params
         self.tables = tables
         self._call: _Call | None = None
@@ -92,13 +92,13 @@ class Native:
     def take(
         self, state: RowState, action: Tensor | None, mask: Tensor | None, shown: Tensor | None = None
     ) -> StateAndShown:
-        """Start an episode in the rows of a mask, and step the others with their actions; see `Rows`.
+        """Start an episode in the rows of a mask, and step the others.
 
         Args:
             state: where the rows are.
             action: int64 [N]; None: no row steps.
             mask: bool [N]; None: no row starts an episode.
-            shown: uint8 [N, *shape], what the rows showed last, where that is at hand and no row steps.
+            shown: uint8 [N, *shape], the last observations, if known and no row steps.
         """
         n = len(self.tables.entry)
         device = self.params.row.device
@@ -113,7 +113,9 @@ class Native:
     def observe(
         self, state: RowState, action: Tensor | None, mask: Tensor | None, shown: Tensor | None = None
     ) -> tuple[RowState, Observed]:
-        """`take` for observations only: every finished row is in the mask; without actions, None is all rows."""
+        """Return only the observations of `take`: every finished row is in the mask; without actions, None means all
+        rows.
+        """
         if action is None and mask is None:
             mask = torch.ones_like(state.node, dtype=torch.bool)
         state, made = self.take(state, action, mask, shown)
@@ -127,11 +129,10 @@ class Native:
         Args:
             state: where the rows are.
             action: int64 [N].
-            most_action: the highest action that a row may take; -1 checks nothing.
+            most_action: the highest action; -1 checks nothing.
 
         Returns:
-            The next state and what the rows show; None for actions of a wrong shape, dtype or range, and where a row's
-            episode was over before.
+            The next state and what the rows show; None for invalid actions and where a row's episode was over before.
         """
         n = len(self.tables.entry)
         if action is None or action.dtype != torch.int64 or action.shape != (n,):
@@ -166,10 +167,10 @@ class Native:
             num_steps: T.
             restarts: rows that a step finishes start an episode within it.
             made: new arrays to fill, which are not checked.
-            arrays: those of ``_ARRAYS``, filled or read; of ``made``, only those that are read.
+            arrays: those of ``_ARRAYS``, filled or read; with ``made``, only those that are read.
 
         Raises:
-            ValueError: for arrays of a wrong shape or dtype, and for states that the rows' tasks cannot have.
+            ValueError: for arrays of a wrong shape or dtype, and states that the rows' tasks cannot have.
         """
         after, wrong = self._run(state, num_steps, restarts, -1, made, **arrays)
         require((wrong == 0, "the rows' states are none of their tasks: they have images outside the bank"))
@@ -184,7 +185,7 @@ class Native:
         made: Shown | Stepped | None = None,
         **arrays: Tensor | None,
     ) -> tuple[RowState, int]:
-        """Call the kernel, see `run`; return the states, and how often it met something wrong."""
+        """Call the kernel; return the states, and how often it met an error."""
         if torch.compiler.is_compiling():  # which cannot look into the call; disabling it takes 50 µs
             run = torch.compiler.disable(self._run)
             return run(state, num_steps, restarts, most_action, made, **arrays)
@@ -215,7 +216,7 @@ class Native:
         return after, wrong
 
     def _own_state(self, state: RowState, call: _Call) -> RowState:
-        """States that the kernel can read: its own are, others are checked."""
+        """States that the kernel can read, checked unless the kernel made them."""
         last = self._state
         if last is not None and all(a is b for a, b in zip(state, last, strict=True)):
             return state
@@ -287,7 +288,7 @@ def _set(call: _Call, name: str, array: Tensor | None, num_steps: int) -> Tensor
 
 
 def _pack(tables: Tables) -> Tensor:
-    """Return the different tasks as int64 [U, fields], in the order of ``Task`` in `kernel.c`; floats by their bits."""
+    """Return the different tasks as int64 [U, fields], ordered as ``Task`` in `kernel.c`; floats by their bits."""
     tree = tables.tree
     x = tables.x
     g = tables.g
@@ -329,11 +330,11 @@ _ARRAYS = {
     "reward": (torch.float32, False, False),
     "episode_reward": (torch.float32, False, False),
 }
-"""Arrays of a call, [T, N, ...]: the dtype, whether it holds images, whether it is read."""
+"""Arrays of a call, [T, N, ...]: dtype, whether it holds images, whether it is read."""
 _READ = [name for name, (*_, is_read) in _ARRAYS.items() if is_read]
 _WRITTEN = [name for name in _ARRAYS if name not in _READ]
 _OF_ROWS = ("mask", "shown")
-"""Those of [N, ...]."""
+"""Arrays of [N, ...]."""
 _StatePointers = ctypes.c_void_p * len(RowState._fields)
 
 

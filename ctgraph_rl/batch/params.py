@@ -1,4 +1,4 @@
-"""From tasks to tensors: the parameters of rows, and the bank of images that they share."""
+"""Parameters of rows from tasks, and the bank of images that rows share."""
 
 from __future__ import annotations
 
@@ -27,16 +27,15 @@ TaskValue = str | Callable[[Task], Any]
 
 @dataclass(frozen=True)
 class _Different:
-    """Different tasks, and tensors with an entry for each of them.
+    """Different tasks, and tensors with an entry for each.
 
-    A value of a task is one of its attributes, by name, or what a function says of it.
+    A value is a task's attribute, by name, or what a function returns for it.
     """
 
     tasks: tuple[Task, ...]
     device: torch.device
 
     def each(self, value: TaskValue, dtype: torch.dtype = torch.int64) -> Tensor:
-        """Return the value of each task."""
         return torch.tensor(list(self._values(value)), dtype=dtype, device=self.device)
 
     def each_kind(self, number: Callable[[Task, StateType], int]) -> Tensor:
@@ -45,7 +44,7 @@ class _Different:
         return torch.tensor(numbers, dtype=torch.int64, device=self.device)
 
     def some(self, value: TaskValue) -> bool:
-        """Return whether the value of some task is neither false nor 0 nor None."""
+        """Return whether the value of any task is true."""
         return any(self._values(value))
 
     def _values(self, value: TaskValue) -> Iterator[Any]:
@@ -53,12 +52,11 @@ class _Different:
 
     @property
     def max_depth(self) -> int:
-        """The largest depth."""
         return max(task.graph.depth for task in self.tasks)
 
 
 class Tables(NamedTuple):
-    """The parameters of different tasks, an entry for each of U, and which entry is each row's."""
+    """The parameters of U different tasks, and which entry is each row's."""
 
     tree: TreeParams
     x: ObservationParams
@@ -69,7 +67,7 @@ class Tables(NamedTuple):
     entry: Tensor  # int64 [N]
 
     def assigned(self, task: Tensor) -> Tables:
-        """Return the tables with other tasks for the rows, by their numbers in the pool, int64 [N]."""
+        """Return the tables with other tasks for the rows, numbers in the pool, int64 [N]."""
         return self._replace(entry=torch.searchsorted(self.number, task))
 
     @property
@@ -83,7 +81,7 @@ class Tables(NamedTuple):
 
 
 def make_tables(tasks: tuple[Task, ...], number: Tensor, bank: Bank) -> Tables:
-    """Return the tables of different tasks with these numbers in their pool; no row has one yet."""
+    """Return the tables of tasks with these numbers in their pool; no row has one yet."""
     different = _Different(tasks, number.device)
     reward_fns = tuple(dict.fromkeys(task.reward_fn for task in tasks))
     extra_end_step = different.each("extra_end_step", torch.bool)
@@ -166,7 +164,7 @@ def _taps(size: int, angles: int, device: torch.device) -> tuple[Tensor, Tensor]
 
 
 def _is_by_node(task: Task, kind: StateType) -> bool:
-    """Whether each state of a kind has an image that is numbered as its node."""
+    """Whether the image of each state of a kind has its node's number."""
     return task.observations.is_unique(kind) and not task.observations.legacy_index
 
 
@@ -223,7 +221,7 @@ def _num_views(task: Task) -> int:
 
 
 class Bank(NamedTuple):
-    """All images that a pool of tasks can show, each different set of them once."""
+    """All images of a pool of tasks, each different set once."""
 
     images: Tensor  # uint8 [rows, *shape]
     shape: tuple[int, ...]  # of an observation
@@ -234,10 +232,10 @@ class Bank(NamedTuple):
 
 
 def observation_shape(pool: Sequence[Task], num_rows: int) -> tuple[int, ...]:
-    """Return the shape of a row's observation; one-hot vectors are as long as the longest of the pool.
+    """Return the shape of a row's observation; one-hot vectors have the pool's greatest length.
 
     Raises:
-        ValueError: for observations of different shapes, and for more than the machine can hold.
+        ValueError: for different shapes, and more than the machine can hold.
     """
     shapes = list(dict.fromkeys(task.images.shape for task in pool))
     one_hot = all(len(shape) == 1 for shape in shapes)
@@ -251,7 +249,7 @@ def make_shared_bank(pool: tuple[Task, ...], num_rows: int, num_noises: int) -> 
     """Return the bank of a pool, with so many noises for each level drawn in advance.
 
     Raises:
-        ValueError: see `observation_shape`.
+        ValueError: as `observation_shape`.
     """
     shape = observation_shape(pool, num_rows)
     levels = tuple(dict.fromkeys(task.observations.read_noise for task in pool))
@@ -277,7 +275,7 @@ def make_shared_bank(pool: tuple[Task, ...], num_rows: int, num_noises: int) -> 
 
 
 def _select_rows(part: Any, index: Tensor) -> Any:
-    """Return parameters of rows from those of their tasks; what is a table of all tasks stays one."""
+    """Return parameters of rows from those of their tasks; tables of all tasks are unchanged."""
     rows = {}
     for name, value in part._asdict().items():
         if isinstance(value, (LegacyIndex, Swap)):
@@ -294,4 +292,4 @@ _TABLES: dict[type, tuple[str, ...]] = {
     LegacyIndex: ("num_ids",),
     RewardParams: (),
 }
-"""What has not one entry for each task."""
+"""Fields without an entry for each task."""

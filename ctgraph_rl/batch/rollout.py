@@ -1,4 +1,4 @@
-"""The fast path: steps of many rows into buffers that are allocated once, without TensorDict or Gymnasium."""
+"""The fast path: steps of many rows into buffers, without TensorDict or Gymnasium."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from ctgraph_rl.core.dynamics import RowState
 from ctgraph_rl.core.tree import is_done
 
 TensorPolicy = Callable[[Tensor, Tensor], Tensor]
-"""What acts: (observation uint8 [N, *shape], is_init bool [N]) -> action int64 [N]."""
+"""A policy: (observation uint8 [N, *shape], is_init bool [N]) -> action int64 [N]."""
 
 
 class Steps(NamedTuple):
-    """T steps of N rows. Finished rows are reset at once; what is seen at the end of an episode is not kept."""
+    """T steps of N rows; finished rows are reset at once, without the last observation of the episode."""
 
     observation: Tensor  # uint8 [T + 1, N, *shape]; number t is seen before action t, number T comes after the last one
     is_init: Tensor  # bool [T + 1, N]: the observation is the first of an episode
@@ -32,7 +32,7 @@ class Steps(NamedTuple):
 
     @classmethod
     def empty(cls, rows: Rows, num_steps: int, device: torch.device | str | None = None) -> Steps:
-        """Buffers for ``num_steps`` steps, for `rollout` to fill again and again; by default on the rows' device."""
+        """Buffers for ``num_steps`` steps, to fill repeatedly; by default on the rows' device."""
         require(*at_least_one(num_steps=num_steps))
         t = num_steps
         n = rows.num_rows
@@ -49,23 +49,23 @@ class Steps(NamedTuple):
 
 @torch.no_grad()
 def rollout(rows: Rows, policy: TensorPolicy | Tensor, steps: Steps, kernel: str = "auto") -> Steps:
-    """Fill buffers with steps, from where the rows are; rows that have not begun or are finished start first.
+    """Fill buffers with steps; rows that have not begun or are finished start an episode first.
 
-    The steps have the bits of `CTGraphEnv` and the Gymnasium environments with the same seeds and actions.
+    The bits are those of `CTGraphEnv` and the Gymnasium environments with the same seeds and actions.
 
     Args:
-        rows: the batch. It is left where the last step led.
-        policy: what acts, or the actions, int64 [T, N].
+        rows: the batch, left where the last step led.
+        policy: what acts, or actions, int64 [T, N].
         steps: the buffers, from `Steps.empty`; filled in place.
-        kernel: ``"auto"`` takes the rows' own engine, ``"off"`` the tensor engine and ``"required"`` the C kernel: see
+        kernel: ``"auto"`` takes the rows' engine, ``"off"`` the tensor engine and ``"required"`` the C kernel, as in
             `Rows`. Given actions are one call of the kernel.
 
     Returns:
         ``steps``.
 
     Raises:
-        ValueError: for buffers of another shape, actions of a wrong shape, dtype or range, and what a required kernel
-            cannot run; the rows stay where they were.
+        ValueError: for buffers of another shape, invalid actions, and what a required kernel cannot run; the rows stay
+            unchanged.
 
     Example:
         >>> from ctgraph_rl.tasks.configurations import ct_su_b1
@@ -159,7 +159,7 @@ def _check_buffers(rows: Rows, steps: Steps) -> None:
 
 
 def _check_actions(rows: Rows, action: Tensor, shape: torch.Size) -> None:
-    """Refuse what is no action. The range is checked on the CPU only: elsewhere the host would have to wait."""
+    """Refuse invalid actions; the range is checked on the CPU only, as elsewhere the host would wait."""
     spec = f"actions must be int64 of shape {list(shape)} with values in 0..{rows.max_branching}"
     require((isinstance(action, Tensor), f"{spec}, got {type(action).__name__}"))
     got = f"{action.dtype} {list(action.shape)}"

@@ -1,4 +1,4 @@
-"""Rows: a batch of CT-graphs as plain tensors, which every face of the environment wraps."""
+"""Rows: a batch of CT-graphs as plain tensors, which every environment wraps."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ T = TypeVar("T")
 
 
 class Rows(TakesNumbers, nn.Module):
-    """A batch of CT-graphs without TorchRL or Gymnasium: one task, one random stream and one state per row.
+    """A batch of CT-graphs without TorchRL or Gymnasium: one task, random stream and state per row.
 
     ``state`` is replaced at every step and never written into. Its fields are buffers, which follow ``to()``.
 
     Args:
-        tasks: one task per row.
-        seed: decides all that is random, in [0, 2**63).
+        tasks: one per row.
+        seed: of all draws, in [0, 2**63).
         first_row: number of the first row, for a batch that is split.
-        task_pool: the tasks that `set_tasks` may be given; the images are fixed by it. Default: ``tasks``.
-        device: where the tensors live.
-        noise_bank: 0 draws the noise of every pixel of every observation. M >= 1 takes each observation's noise from M
-            drawn in advance, which is faster; two observations then share noise with probability 1 / M.
-        kernel: whether the C kernel takes the steps, with the bits of the tensor engine. It needs a CPU, a C compiler
-            and rewards of this package. ``"auto"`` uses it where it can run and steps are not traced, as by
-            ``torch.compile``; ``"off"`` never does; ``"required"`` refuses what it cannot run.
+        task_pool: the tasks that `set_tasks` may be given, which fix the images. Default: ``tasks``.
+        device: of the tensors.
+        noise_bank: 0 draws noise for every pixel of every observation. M >= 1 takes an observation's noise from M drawn
+            in advance, which is faster; two observations then share noise with probability 1 / M.
+        kernel: whether the C kernel takes the steps, with the same bits. It needs a CPU, a C compiler and rewards of
+            this package. ``"auto"`` uses it where it can run and steps are not traced, as by ``torch.compile``;
+            ``"off"`` never does; ``"required"`` refuses what it cannot run.
 
     Raises:
         ValueError: for no tasks, values out of range, observations of different shapes, and what a required kernel
@@ -67,7 +67,7 @@ class Rows(TakesNumbers, nn.Module):
     choice: Tensor
     episodes: Tensor
     tasks_change: bool
-    """Whether rows may change to other tasks where they start episodes."""
+    """Whether rows may change tasks when they start episodes."""
 
     def __init__(
         self,
@@ -118,7 +118,7 @@ class Rows(TakesNumbers, nn.Module):
         return self.row.device
 
     def _choose_engine(self) -> None:
-        """Find out whether the kernel can run; refuse that it cannot where it must."""
+        """Find out whether the kernel can run; raise if it cannot but is required."""
         reward_fns = [task.reward_fn for task in self.pool]
         if self.kernel == "required":
             require_kernel(reward_fns, self.device)
@@ -126,7 +126,7 @@ class Rows(TakesNumbers, nn.Module):
 
     @property
     def uses_kernel(self) -> bool:
-        """Whether the C kernel takes the steps, else the tensor engine does."""
+        """Whether the C kernel takes the steps, not the tensor engine."""
         return self.kernel == "required" or (self._kernel_fits and not is_traced() and is_available())
 
     @property
@@ -164,11 +164,11 @@ class Rows(TakesNumbers, nn.Module):
 
         Args:
             tasks: one task of the pool per row.
-            at_episode_end: a row has the new task from its next reset on. False: all episodes end at once: `reset`
-                before the next step.
+            at_episode_end: each row has its new task from its next reset on. False ends all episodes: `reset` before
+                the next step.
 
         Raises:
-            ValueError: if the number of tasks is not the number of rows, or a task is not in the pool.
+            ValueError: if there is not one task per row, or a task is not in the pool.
         """
         tasks = require_all(Task, "tasks", tasks)
         n = self.num_rows
@@ -178,7 +178,7 @@ class Rows(TakesNumbers, nn.Module):
         self._choose(whole_pool, numbers, None, at_episode_end)
 
     def switch_tasks(self, tasks: Iterable[Task], switch: Switch, at_episode_end: bool = False) -> None:
-        """Let the rows change between tasks from episode to episode, all of them beginning with the first.
+        """Let rows change between tasks from episode to episode, beginning with the first.
 
         Args:
             tasks: at least two tasks of the pool.
@@ -202,7 +202,7 @@ class Rows(TakesNumbers, nn.Module):
             self._restart(chosen)
 
     def _restart(self, assignment: Assignment) -> None:
-        """End all episodes; the next one of every row is the first with its choice and that task's goal."""
+        """End all episodes; the next ones are the first with these choices and goals."""
         self.assignment = assignment.restarted()
         self._make_tables()
         self._end_episodes()
@@ -225,7 +225,7 @@ class Rows(TakesNumbers, nn.Module):
         self.native.bind(params, self.tables)
 
     def _start_episodes(self, mask: Tensor | None) -> None:
-        """Change to the tasks that are chosen for rows that start an episode; the host waits for the device."""
+        """Change to the tasks chosen for rows that start an episode; the host waits for the device."""
         if not self.tasks_change:
             return
         mask = torch.ones_like(self.task, dtype=torch.bool) if mask is None else mask
@@ -238,10 +238,10 @@ class Rows(TakesNumbers, nn.Module):
             self.episodes_left = torch.where(changed, 0, self.episodes_left)
 
     def set_goals(self, goals: Iterable[Sequence[int]] | Tensor) -> None:
-        """Give every row a goal, in the middle of an episode too; `set_tasks` and `set_seed` restore the tasks' goals.
+        """Give every row a goal, also within an episode; `set_tasks` and `set_seed` restore the tasks' goals.
 
         Args:
-            goals: for every row its decisions in 1..b, also as [N, d]; or the numbers of end states, int64 [N].
+            goals: decisions in 1..b for every row, also as [N, d]; or numbers of end states, int64 [N].
 
         Raises:
             ValueError: if a goal is not one of its row's tree.
@@ -256,16 +256,16 @@ class Rows(TakesNumbers, nn.Module):
 
     @takes_numbers
     def set_seed(self, seed: int) -> None:
-        """Restart all rows with another seed and their tasks' goals; the next `reset` gives their first episodes."""
+        """Restart all rows with another seed and their tasks' goals; `reset` gives their first episodes."""
         require(seed_rule(seed))
         self.set_streams(torch.tensor([seed], device=self.device, dtype=torch.int64), self.row)
 
     def set_streams(self, seed: Tensor, row: Tensor) -> None:
-        """Restart all rows with their own random streams.
+        """Restart all rows with separate random streams.
 
         Args:
             seed: int64 [N], or [1] for all.
-            row: int64 [N], the numbers that distinguish rows of one seed.
+            row: int64 [N], distinguishes rows of one seed.
         """
         self.seed = seed.clone()
         self.row = row.clone()
@@ -277,13 +277,13 @@ class Rows(TakesNumbers, nn.Module):
             self._end_episodes()
 
     def reset(self, mask: Tensor | None = None) -> Shown:
-        """Start an episode in the rows of a mask, bool [N], or in all; what all rows show."""
+        """Start an episode in the rows of a mask, bool [N], or in all; return what all rows show."""
         mask = torch.ones_like(self.row, dtype=torch.bool) if mask is None else mask
         self._start_episodes(mask)
         return self._keep(*self.engine.take(self.state, None, mask))
 
     def step(self, action: Tensor, mask: Tensor | None = None) -> Shown:
-        """One step of all rows, or of those of a mask, bool [N], with actions, int64 [N]; what all rows show.
+        """Step all rows, or those of a mask, bool [N], with actions, int64 [N]; return what all rows show.
 
         The reward is in ``state``. Rows outside the mask stay unchanged, draw nothing, and may have any action.
         """
@@ -296,27 +296,29 @@ class Rows(TakesNumbers, nn.Module):
         return self._keep(state, shown)
 
     def act(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        """`step` with less, for rows none of which is finished: what all rows observe, and which are done, bool [N].
+        """Step rows of which none is finished; return only their observations and which are done, bool [N].
 
-        `result` tells more.
+        `result` returns more.
         """
         observation, done = self._keep(*self.engine.observe(self.state, action, None))
         assert done is not None
         return observation, done
 
     def step_or_reset(self, action: Tensor, mask: Tensor) -> Shown:
-        """Start an episode in the rows of a mask, whatever their action, and step the others; what all rows show."""
+        """Start an episode in the rows of a mask, whatever their action, and step the others; return what all rows
+        show.
+        """
         self._start_episodes(mask)
         return self._keep(*self.engine.take(self.state, action, mask))
 
     def result(self, done: Tensor) -> tuple[Tensor, Tensor]:
-        """Outcome, uint8 [N], and leaf, int64 [N], of the rows that are done; see `CTGraphEnv`."""
+        """Return outcome, uint8 [N], and leaf, int64 [N], of the rows that are done."""
         return dynamics.outcome(self.state, done, self.params)
 
     def restart(self, mask: Tensor | None = None, shown: Tensor | None = None) -> Tensor:
-        """`reset` of all rows, or of all finished ones, the mask: what all rows observe.
+        """Start an episode in all rows, or in all finished ones, the mask; return what all rows observe.
 
-        ``shown``, uint8 [N, *shape], is what the rows observed last, where that is at hand.
+        ``shown``, uint8 [N, *shape], is their last observation, if known.
         """
         self._start_episodes(mask)
         return self._keep(*self.engine.observe(self.state, None, mask, shown))[0]
@@ -331,16 +333,16 @@ class Rows(TakesNumbers, nn.Module):
 
     @property
     def observation_id(self) -> Tensor:
-        """The ids that the rows show now, int64 [N]."""
+        """The ids that the rows show, int64 [N]."""
         return dynamics.observation_id(self.state, self.params, self.uses)
 
     @property
     def is_done(self) -> Tensor:
-        """bool [N]: rows whose episode is over."""
+        """Rows whose episode is over, bool [N]."""
         return is_done(self.state, self.params.tree)
 
     def check_actions(self, action: Tensor | None, mask: Tensor | None = None) -> None:
-        """Refuse with a ValueError actions of a wrong shape, dtype or range, and steps of finished rows; see `step`."""
+        """Raise a ValueError for actions of a wrong shape, dtype or range, and for steps of finished rows."""
         spec = f"action must be int64 of shape [{self.num_rows}] with values in 0..{self.max_branching}"
         require((action is not None, f"{spec}, got none: a policy must write it before a step"))
         assert action is not None
@@ -363,7 +365,7 @@ class Rows(TakesNumbers, nn.Module):
         self.episodes_left = torch.zeros_like(self.episodes_left)
 
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
-        """Load into copies: a loaded buffer is written into, and someone may hold the present one."""
+        """Load into copies, as others may hold the present buffers."""
         for field in ("seed", "row", *_ASSIGNED, *RowState._fields):
             self._buffers[field] = self._buffers[field].clone()  # type: ignore[union-attr]
         super()._load_from_state_dict(*args, **kwargs)

@@ -16,7 +16,7 @@ from ctgraph_rl.tasks.task import Task
 
 
 class Specs(NamedTuple):
-    """The specs of what a policy reads and writes."""
+    """What a policy reads and writes."""
 
     observation: Composite
     action: Categorical
@@ -29,12 +29,12 @@ def make_specs(
 
     Args:
         pool: the tasks that rows may have.
-        batch_size: () for the unbatched specs, which agents are built from; (N,) for those of N rows.
+        batch_size: () for unbatched specs, from which agents are built; (N,) for N rows.
         num_task_ids: length of ``task_id``; 0 for none.
-        info: whether ``step_count``, ``episode_reward``, ``outcome`` and ``leaf`` are there.
+        info: with ``step_count``, ``episode_reward``, ``outcome`` and ``leaf``.
 
     Raises:
-        ValueError: for observations of different shapes, and for more than the machine can hold.
+        ValueError: for observations of different shapes, and more than the machine can hold.
     """
     shape = observation_shape(pool, math.prod(batch_size))
     white = 255 if len(shape) == 3 else max(int(white_level(task.images)) for task in pool)
@@ -51,11 +51,11 @@ def observation_spec(
     """Return the spec of what rows show, on the CPU.
 
     Args:
-        observation: the spec of their observations.
-        batch_size: see `make_specs`, as for ``num_task_ids``.
-        num_task_ids: length of ``task_id``.
-        info: whether ``step_count`` and ``episode_reward`` are there.
-        ends: whether ``outcome`` and ``leaf`` are there.
+        observation: of their observations.
+        batch_size: as in `make_specs`.
+        num_task_ids: length of ``task_id``; 0 for none.
+        info: with ``step_count`` and ``episode_reward``.
+        ends: with ``outcome`` and ``leaf``.
     """
     column = (*batch_size, 1)
     number = Unbounded(shape=column, dtype=torch.int64, device="cpu")
@@ -72,12 +72,12 @@ def observation_spec(
 
 
 def reward_spec(batch_size: tuple[int, ...]) -> Unbounded:
-    """Return the spec of the reward of rows, on the CPU."""
+    """Return the spec of rewards, on the CPU."""
     return Unbounded(shape=(*batch_size, 1), dtype=torch.float32, device="cpu")
 
 
 def done_spec(batch_size: tuple[int, ...], truncated: bool = True) -> Composite:
-    """Return the spec of the ends of rows' episodes, with or without ``truncated``, on the CPU."""
+    """Return the spec of episodes' ends, with or without ``truncated``, on the CPU."""
     keys = ["done", "terminated", "truncated"] if truncated else ["done", "terminated"]
     return Composite({key: _flag(batch_size) for key in keys}, shape=batch_size, device="cpu")
 

@@ -1,6 +1,6 @@
-"""The tensor engine of a batch: the functions of `dynamics`, with draws made ahead; its twin is `native`.
+"""The tensor engine of a batch: the functions of `dynamics` with draws made ahead; its twin is `native`.
 
-Small batches make the small draws of many ticks in one call, as many calls would cost more.
+Small batches draw for many ticks in one call.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ MAX_TICKS = 256
 
 
 class DrawsAhead:
-    """The draws of rows, see `dynamics.Words`, for the ticks that they are at and those that follow.
+    """The draws of rows, `dynamics.Words`, for their present and following ticks.
 
-    A step that is compiled makes its own draws: a table would need another graph for each tick of it.
+    A compiled step makes its draws itself: a table would need a graph for each tick of it.
 
     Args:
         params: the rows' parameters.
-        uses: what the rows have use for.
+        uses: what the rows draw for.
     """
 
     def __init__(self, params: RowParams, uses: Uses) -> None:
@@ -40,7 +40,6 @@ class DrawsAhead:
         self._tick: Tensor | None = None
 
     def serve(self, params: RowParams, uses: Uses) -> bool:
-        """Return whether rows with other parameters have the same draws."""
         own = self._params
         return params.seed is own.seed and params.row is own.row and uses is self._uses
 
@@ -50,14 +49,13 @@ class DrawsAhead:
         self._now = words
 
     def now(self, tick: Tensor) -> Words:
-        """Return the draws of the ticks that the rows are at."""
         if tick is not self._tick:  # they were moved by others
             self._left = 0
             self.move(tick, self._at(tick, tick))
         return self._now
 
     def then(self, tick: Tensor, ahead: Tensor | int) -> Words:
-        """Return the draws of ticks that are ahead, by 0 or 1, of those that the rows are at."""
+        """Return the draws of ticks that are 0 or 1 ahead of the rows'."""
         if tick is not self._tick:
             self._tick = None
             self._left = 0
@@ -85,7 +83,7 @@ class DrawsAhead:
 
 
 class TensorEngine:
-    """Takes the steps of one batch on any device; a method returns the next states and what rows show.
+    """Takes the steps of a batch on any device; methods return the next states and what rows show.
 
     Bind parameters before the first step.
     """
@@ -105,7 +103,7 @@ class TensorEngine:
     def take(
         self, state: RowState, action: Tensor | None, mask: Tensor | None, shown: Tensor | None = None
     ) -> StateAndShown:
-        """See `Native.take`; ``shown`` is not needed."""
+        """Take a step as `Native.take`; ``shown`` is not needed."""
         if action is None:
             assert mask is not None
             then = self._draws.then(state.tick, mask)
@@ -124,7 +122,7 @@ class TensorEngine:
     def observe(
         self, state: RowState, action: Tensor | None, mask: Tensor | None, shown: Tensor | None = None
     ) -> tuple[RowState, Observed]:
-        """See `Native.observe`."""
+        """Return observations only, as `Native.observe`."""
         if action is None:
             words = self._draws.then(state.tick, 1 if mask is None else mask)
             state, observation = dynamics.restart(state, mask, self.params, self.uses, words)

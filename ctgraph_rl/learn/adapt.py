@@ -18,7 +18,7 @@ from ctgraph_rl.learn.logits_policy import as_policy, positional_parameters
 
 
 def adapt(policy: Any, greedy: bool, num_actions: int | None, shows_ids: bool = False) -> Policy:
-    """Any policy as a function of TensorDicts; see `ctgraph_rl.Recorder`.
+    """Return any policy, as `ctgraph_rl.Recorder` takes, as a function of TensorDicts.
 
     Raises:
         ValueError: for what is no policy.
@@ -52,12 +52,7 @@ def _parts(shown: Any) -> tuple[Any, Any]:
 
 
 class _NumpyPolicy:
-    """A function of NumPy arrays that acts on TensorDicts; it remembers from one step to the next.
-
-    Args:
-        act: the function.
-        discrete: whether actions are integers.
-    """
+    """A function of NumPy arrays that acts on TensorDicts and remembers from step to step."""
 
     def __init__(self, act: Callable[[Any, Any, Any], tuple[Any, Any]], discrete: bool = True) -> None:
         self.act = act

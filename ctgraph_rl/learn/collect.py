@@ -1,4 +1,4 @@
-"""Batches of experience: the environment of a curriculum, and a policy that acts in it step after step."""
+"""Collection of batches: a policy acts in a curriculum's environment."""
 
 from __future__ import annotations
 
@@ -29,29 +29,29 @@ InitialState = Callable[[int], TensorDict]
 """Return the initial recurrent state of a number of environments."""
 
 SHOWN = ("observation", "is_init", "step_count", "episode_reward")
-"""What every environment shows."""
 
 TRIAL = "trial"
 """A recurrent state with this key lasts over episodes: the policy resets it itself, where a trial begins."""
 
 PREVIOUS_ACTION = "previous_action"
-"""The key under which a recurrent state has the last action, int64 [rows]."""
+"""Key of the last action in a recurrent state, int64 [rows]."""
 
 UNSTORED = "unstored_"
-"""A recurrent state under a key with this beginning is carried from step to step, and a batch does not hold it for each
-of them: all steps of the batch show its value before the first one, and, after each step, that after the last one."""
+"""Prefix of recurrent states that a batch does not store for each step: every step shows the value before the first
+one, and, under ``next``, the value after the last one.
+"""
 
 Step = dict[Any, Tensor]
-"""What was seen, done and written in a step of all rows, and under keys ``("next", key)`` what came after it."""
+"""Data of one step of all rows; ``("next", key)`` holds what followed."""
 
 
 @takes_numbers
 def make_env(
     curriculum: Curriculum, tasks: Sequence[TaskLike], seed: int, device: torch.device | str = "cpu"
 ) -> EnvBase:
-    """Return an environment for a curriculum's tasks, one per row, that shows task ids where the protocol gives them.
+    """Return an environment with one task per row, which shows task ids if the protocol gives them.
 
-    Held-out tasks have no id, which shows as zeros.
+    Held-out tasks show zeros as their id.
 
     Raises:
         ValueError: for an environment of a user that lacks what `TaskLike.make_env` asks for.
@@ -83,9 +83,7 @@ def _env_rules(env: Any, kind: str, num_rows: int, num_task_ids: int) -> Iterato
 
 
 def agent_specs(curriculum: Curriculum) -> Specs:
-    """Return the unbatched specs of `make_env`, which agents are built from.
-
-    Those of CT-graphs are made without building an environment.
+    """Return the unbatched specs of `make_env`, from which agents are built.
 
     Raises:
         ValueError: if the tasks cannot be rows of one environment.
@@ -101,7 +99,7 @@ def agent_specs(curriculum: Curriculum) -> Specs:
 
 
 def _pool_and_ids(curriculum: Curriculum) -> tuple[tuple[TaskLike, ...], int]:
-    """Return all tasks of a curriculum, held-out ones too, and the length of the task ids in observations or 0."""
+    """Return all tasks, held-out ones too, and the length of shown task ids, or 0."""
     how = curriculum.protocol
     pool = (*curriculum.tasks, *curriculum.evaluation.held_out)
     return pool, how.length(len(curriculum.tasks)) if how.task_id == "one_hot" else 0
@@ -116,18 +114,18 @@ def collect(
     initial_state: InitialState | None = None,
     between_steps: Callable[[int], object] | None = None,
 ) -> Iterator[TensorDictBase]:
-    """Yield batches of [rows, num_steps] in time order, from a reset on; the last one may be shorter.
+    """Yield batches of [rows, num_steps] in time order, starting with a reset; the last one may be shorter.
 
     Args:
         env: where to act.
         policy: writes ``action`` and, if recurrent, its state under ``("next", key)``.
-        num_frames: frames in all, a multiple of the rows.
+        num_frames: a multiple of the rows.
         num_steps: steps in a batch.
-        initial_state: gives the recurrent state that the rows start with.
-        between_steps: called before every step with the frames collected so far; after a batch, once it was used.
+        initial_state: gives the rows' first recurrent state.
+        between_steps: called before every step with the frames so far; after a batch, once it was used.
 
     Raises:
-        ValueError: for a number of frames that is not a multiple of the rows, and less than one step.
+        ValueError: for frames that are not a multiple of the rows, or less than one step.
     """
     whole = is_int(num_frames, 1) and num_frames % env.numel() == 0
     require(
@@ -150,10 +148,7 @@ def batches(
     carried: TensorDictBase | None = None,
     done: int = 0,
 ) -> Iterator[tuple[TensorDictBase, TensorDictBase]]:
-    """Yield the batches of `collect`, each with the data ``carried`` into the next step.
-
-    With ``carried`` and ``done`` it resumes after ``done`` frames.
-    """
+    """Yield the batches of `collect` and the data ``carried`` into the next step; ``done`` frames resume from it."""
     start = make_start(env, initial_state)
     data = dict((env.reset().update(start) if carried is None else carried).items(True, True))
     act_once = CapturedAct(env, policy, start) if _is_captured(env, policy) else partial(act, env, policy, start=start)
@@ -176,10 +171,10 @@ def make_start(env: EnvBase, initial_state: InitialState | None) -> Step:
 
 
 def act(env: EnvBase, policy: Policy, data: Step, start: Step) -> tuple[Step, Step]:
-    """Take a step in every row; return it, and the data of the next one, reset where an episode ended.
+    """Step every row; return the step and the data of the next one, reset where an episode ended.
 
-    A policy whose class defines ``act_on_tensors`` takes the data by key and returns what it would write, which saves
-    the time of a TensorDict and a module. Derived classes, modules around it and hooks are called.
+    A policy whose class defines ``act_on_tensors`` gets a plain dict instead of a TensorDict, which is faster. Derived
+    classes, modules around it and hooks are called.
     """
     if _acts_on_tensors(policy):
         data = data | policy.act_on_tensors(data)  # type: ignore[attr-defined]
@@ -200,19 +195,19 @@ def _acts_on_tensors(policy: Policy) -> bool:
 
 
 def _is_captured(env: EnvBase, policy: Policy) -> bool:
-    """Return whether steps are captured as a CUDA graph: those of policies that say that they are ``capturable``."""
+    """Return whether steps run as a CUDA graph: those of a ``capturable`` policy."""
     return type(env) is CTGraphEnv and getattr(policy, "capturable", False) and captures(env.device)
 
 
 class CapturedAct:
-    """`act` as a `Region`: on a GPU a step of all rows is one CUDA graph, captured again when rows get other tasks.
+    """`act` as a `Region`: on a GPU one CUDA graph, captured again when rows change tasks.
 
-    While rows may change tasks at any episode's end, which needs the host, steps are not captured.
+    Nothing is captured while rows may change tasks at any episode's end, which needs the host.
 
     Args:
-        env: where to act. Its actions are not checked.
+        env: where to act; actions are not checked.
         policy: writes ``action``, without a branch on data.
-        start: the recurrent state that every episode starts with.
+        start: the recurrent state at the start of an episode.
     """
 
     def __init__(self, env: CTGraphEnv, policy: Policy, start: Step) -> None:
@@ -224,7 +219,7 @@ class CapturedAct:
         self._params: RowParams | None = None
 
     def __call__(self, data: Step) -> tuple[Step, Step]:
-        """See `act`."""
+        """Step every row, as `act`."""
         rows = self.env.rows
         if rows.tasks_change:
             return act(self.env, self.policy, data, self.start)
@@ -260,12 +255,12 @@ def _part(label: str, values: Step) -> Step:
 
 
 def take_step(env: EnvBase, data: Step) -> tuple[Step, Step]:
-    """Step all rows with the actions in their data; rows that are finished start an episode at once.
+    """Step all rows; rows that are finished start an episode at once.
 
-    The same as ``env.step_and_maybe_reset``, in half the time.
+    Equals ``env.step_and_maybe_reset`` in half the time.
 
     Returns:
-        The step, and the data that the next one starts from.
+        The step, and the data of the next one.
     """
     if type(env) is not CTGraphEnv:
         taken, following = env.step_and_maybe_reset(TensorDict(data, env.batch_size, device=env.device))

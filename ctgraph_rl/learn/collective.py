@@ -1,7 +1,4 @@
-"""A collective: learners that each learn a curriculum, in lock-step, and exchange messages.
-
-Seeds that are trained as one batch are no collective, as they share nothing; see `ctgraph_rl.learn.stacked`.
-"""
+"""A collective: learners learn a curriculum each, in lock-step, and exchange messages."""
 
 from __future__ import annotations
 
@@ -25,18 +22,18 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 
 
 class Help(NamedTuple):
-    """What a learner has taken over from another."""
+    """What a learner took over from another."""
 
     sender: int
     receiver: int
     values: Mapping[str, float]
-    """Numbers to log by name, such as the sender's return."""
+    """To log by name, such as the sender's return."""
 
 
 class ExchangeLike(Protocol):
-    """What learners of a collective tell each other, such as `baselines.exchanges.l2d2c.L2D2C`.
+    """The messages of a collective's learners, such as `baselines.exchanges.l2d2c.L2D2C`.
 
-    It draws nothing from torch's global generator.
+    It does not draw from torch's global generator.
     """
 
     num_members: int
@@ -46,14 +43,14 @@ class ExchangeLike(Protocol):
     drop_prob: float
     delay_prob: float
     kinds: Mapping[str, Fields]
-    """The kinds of messages in the order in which they are sent within an exchange, each with its fields."""
+    """The kinds of messages, in the order in which an exchange sends them, with their fields."""
 
     def settings_of(self, member: int) -> ReadOnlyValues:
-        """Return settings that only this member has, such as ``{"agent.learning_rate": 0.01}``; none: those of all."""
+        """Return this member's special settings, such as ``{"agent.learning_rate": 0.01}``."""
         ...
 
     def connect(self, agents: Sequence[Agent]) -> None:
-        """Take the agents of all members, before anything is learned.
+        """Take the agents of all members, before they learn.
 
         Raises:
             ValueError: if they cannot exchange messages.
@@ -61,19 +58,19 @@ class ExchangeLike(Protocol):
         ...
 
     def observe(self, member: int, batch: TensorDictBase, episode_return: float) -> None:
-        """Called after a member has learned from a batch; its finished episodes returned ``episode_return``."""
+        """Take a batch that a member has learned from, and the mean return of its finished episodes."""
         ...
 
     def send(self, kind: str, member: int, received: Sequence[Message]) -> Sequence[Message]:
-        """Return the messages of a kind that a member sends, given those of the kind before that it has received."""
+        """Return a member's messages of a kind, given those it received of the kind before."""
         ...
 
     def receive(self, member: int, received: Sequence[Message]) -> Sequence[Help]:
-        """Let a member use the messages of the last kind; return what it has taken over."""
+        """Let a member use the messages of the last kind; return what it took over."""
         ...
 
     def state_dict(self) -> NamedValues:
-        """Return what a resumed run needs, as tensors and plain Python values."""
+        """Return what a resumed run needs, as tensors and plain values."""
         ...
 
     def load_state_dict(self, state: ReadOnlyValues) -> None:
@@ -87,11 +84,10 @@ class Member:
 
     Args:
         curriculum: what it learns.
-        agent: the learner; another one for each member.
+        agent: the learner; shared with no other member.
         seed: of its environment.
         log: where its measurements are appended.
-        random: the state of torch's global generator that it draws from; by default the present one, so a member is
-            made right after its agent.
+        random: its state of torch's global generator; default: the present one, so make a member right after its agent.
     """
 
     curriculum: Curriculum
@@ -113,30 +109,30 @@ def learn_collective(
     saved: ReadOnlyValues | None = None,
     checkpoint: OfferCheckpoint | None = None,
 ) -> RunLog:
-    """Let the members of a collective learn in lock-step, a batch each in turn, with messages between batches.
+    """Let members learn in lock-step, a batch each in turn, with messages between batches.
 
-    A member that takes over nothing has the bits of `learn_curriculum`. One that has finished its curriculum
-    still answers the others, and takes over nothing.
+    A member that takes over nothing has the bits of `learn_curriculum`. One that has finished its curriculum still
+    answers, and takes over nothing.
 
     Args:
         members: the learners.
-        exchange: what they tell each other, and when.
+        exchange: what messages they send, and when.
         seed: decides which messages are lost or late.
-        log: of the collective: a line ``exchange`` for each exchange that had messages, and a line ``help`` for what a
-            member took over, which is also in its own log, as is what it refused; default: a new one in memory.
-        progress: is updated after each round with the frames of all members and their mean return.
-        device: where the environments live, and the agents.
-        saved: a state that ``checkpoint`` was given, to resume from with the same bits as if nothing had stopped.
-            Members are built as they were, and the logs hold what they held then.
-        checkpoint: is offered the state of all after each round.
+        log: of the collective: lines ``exchange`` for messages and ``help`` for what members took over. The members'
+            own logs also have the latter, and what they refused. Default: a new one in memory.
+        progress: updated after each round with the frames of all members and their mean return.
+        device: of environments and agents.
+        saved: a state that ``checkpoint`` was given, to resume with the same bits. Members are built the same way, and
+            their logs hold what they held then.
+        checkpoint: is offered the state after each round.
 
     Returns:
         The log of the collective.
 
     Raises:
-        ValueError: before any work, for members that are not as many as ``exchange.num_members``, share an agent or a
-            log, or cannot learn their curriculum; each is named by its number, from 0.
-        FloatingPointError: if a loss or weight of a member is not finite; names the member, block and frames.
+        ValueError: before any work, if members are not ``exchange.num_members``, share an agent or a log, or cannot
+            learn their curriculum; names the member, from 0.
+        FloatingPointError: if a loss or weight is not finite; names the member, block and frames.
     """
     members = require_all(Member, "members", members)
     log = RunLog() if log is None else log
@@ -150,7 +146,6 @@ def learn_collective(
 
 
 def _check(members: Sequence[Member], exchange: ExchangeLike) -> None:
-    """Refuse members that are too many, too few, or not apart."""
     count = len(members)
     agents = {id(each.agent) for each in members}
     logs = {id(each.log) for each in members}
@@ -164,7 +159,7 @@ def _check(members: Sequence[Member], exchange: ExchangeLike) -> None:
 
 
 class _Learner:
-    """A member that learns batch by batch, with a state of torch's global generator that is only its own."""
+    """A member that learns batch by batch, with a separate state of torch's global generator."""
 
     def __init__(self, number: int, member: Member, device: torch.device, saved: SavedState | None) -> None:
         self.number = number
@@ -193,7 +188,7 @@ class _Learner:
 
     @contextmanager
     def drawing(self) -> Iterator[None]:
-        """Let torch's global generators be those of this member."""
+        """Replace torch's global generators by those of this member."""
         before = torch.get_rng_state()
         before_cuda = self._cuda_state()
         torch.set_rng_state(self.random)
@@ -234,8 +229,6 @@ class _Learner:
 
 
 class _Collective:
-    """All members, and what is between them."""
-
     def __init__(self, members: Sequence[Member], exchange: ExchangeLike, mail: Mail, log: RunLog) -> None:
         self.members = members
         self.exchange = exchange
@@ -247,7 +240,7 @@ class _Collective:
         """Those that have learned in this round."""
 
     def start(self, device: torch.device, saved: ReadOnlyValues | None) -> None:
-        """Let all members begin, or go back to a saved state."""
+        """Start all members, from a saved state if there is one."""
         states: Sequence[Any] = [None] * len(self.members) if saved is None else saved["members"]
         count = f"the saved state has {len(states)} members, there are {len(self.members)}; start again"
         require((len(states) == len(self.members), count))
@@ -260,7 +253,6 @@ class _Collective:
                 self.exchange.load_state_dict(saved["exchange"])
 
     def close(self) -> None:
-        """Close the environments of all members that have begun."""
         for learner in self.learners:
             learner.steps.close()
 
@@ -271,26 +263,25 @@ class _Collective:
 
     @property
     def block(self) -> int:
-        """The highest block that is learned, from 1."""
+        """The highest present block, from 1."""
         return max(learner.steps.block for learner in self.advanced)
 
     @property
     def returns(self) -> list[float]:
-        """The mean return of the last batch of each member that has learned."""
         return [learner.steps.returns[0] for learner in self.advanced]
 
     @property
     def is_at_block_end(self) -> bool:
-        """Whether a block of a member ends with its last batch."""
+        """Whether a member's last batch ends a block."""
         return any(learner.steps.is_at_block_end for learner in self.advanced)
 
     @property
     def can_resume(self) -> bool:
-        """Whether all can resume from this state as if they had not stopped."""
+        """Whether all can resume from this state with the same bits."""
         return all(learner.steps.can_resume for learner in self.learners)
 
     def advance(self) -> bool:
-        """Let each member learn from a batch, and all exchange messages if it is time; False if none has learned."""
+        """Let each member learn from a batch, then exchange messages if due; False if none has learned."""
         self.advanced = [learner for learner in self.learners if learner.advance()]
         for learner in self.advanced:
             self.exchange.observe(learner.number, learner.steps.batch, learner.steps.returns[0])
@@ -300,7 +291,7 @@ class _Collective:
         return bool(self.advanced)
 
     def _exchange(self) -> None:
-        """Send messages of one kind after the other, and let members use the last."""
+        """Send messages kind after kind, and let members use the last."""
         self.mail.begin()
         received: dict[int, list[Message]] = {number: [] for number in range(len(self.members))}
         for kind in self.exchange.kinds:
@@ -342,7 +333,6 @@ class _Collective:
         self.log.append("help", round=self.rounds, **self._place(given.receiver), receiver=given.receiver, **values)
 
     def _place(self, number: int) -> dict[str, int]:
-        """Return the block of a member, and its frames so far."""
         frames = self.learners[number].steps.frames
         return {"block": self.members[number].curriculum.block_at(frames), "frames": frames}
 

@@ -1,4 +1,4 @@
-"""Evaluation: equally many episodes on every task, in their own environments, at the moments of a curriculum."""
+"""Evaluation: equally many episodes on every task, at the moments of a curriculum."""
 
 from __future__ import annotations
 
@@ -45,31 +45,30 @@ def evaluate(
     device: torch.device | str = "cpu",
     curriculum: Curriculum | None = None,
 ) -> TensorDict:
-    """Play the same number of episodes on every task, all in one batch, and equally many in every environment.
+    """Play the same number of episodes on every task, all in one batch.
 
-    The environment is a separate one, and torch's global generator is left as it was found.
+    The environment is separate, and torch's global generator is left unchanged.
 
     Args:
-        policy: what plays; a class such as `ctgraph_rl.policies.OptimalPolicy` is built on the environment, and a plain
+        policy: what plays. A class such as `ctgraph_rl.policies.OptimalPolicy` is built on the environment; a plain
             module maps observations to logits, see `LogitsPolicy`.
         tasks: what is played.
         num_episodes: episodes per task.
-        seed: decides the environment and, if not greedy, the policy's draws.
+        seed: of the environment and, if not greedy, of the policy's draws.
         greedy: take the most likely actions; False samples and explores as in training.
-        episodes_per_row: episodes that a row plays one after the other; a divisor of ``num_episodes``. More than one is
-            needed where the goal changes from episode to episode.
+        episodes_per_row: successive episodes of a row, a divisor of ``num_episodes``. Goals that change between
+            episodes need more than one.
         initial_state: gives a recurrent policy's state for a number of environments.
-        device: where the environment lives.
-        curriculum: whose task ids the policy sees, if its protocol shows them with observations.
+        device: of the environment.
+        curriculum: whose task ids the policy sees, if its protocol shows them.
 
     Returns:
-        ``episode_reward`` float32, ``step_count`` int64, ``outcome`` uint8 and ``leaf`` int64, each
-        [tasks, num_episodes, 1], at the end of the episodes; those of a row follow each other. Only CT-graphs
-        have ``outcome`` and ``leaf``.
+        ``episode_reward`` float32, ``step_count`` int64, ``outcome`` uint8 and ``leaf`` int64 at the ends of episodes,
+        each [tasks, num_episodes, 1]; those of a row are adjacent. Only CT-graphs have the last two.
 
     Raises:
-        ValueError: for values out of range, a task with changing goals and one episode a row, a reference policy that
-            was built on another environment, and a module that gives no logits.
+        ValueError: for values out of range, a task with changing goals and one episode a row, a reference policy built
+            on another environment, and a module that gives no logits.
 
     Example:
         >>> from ctgraph_rl.policies import OptimalPolicy
@@ -112,7 +111,7 @@ def _build_on(env: EnvBase, policy: type) -> Policy:
 
 
 def num_actions(env: EnvBase) -> int | None:
-    """Return the number of actions of an environment; None where they are continuous."""
+    """Return the number of actions; None where they are continuous."""
     return getattr(env.action_spec_unbatched, "n", None)
 
 
@@ -133,16 +132,15 @@ def _first_episodes(env: EnvBase, policy: Policy, initial_state: InitialState | 
 
 
 EPISODE_KEYS = ("episode_reward", "outcome", "step_count")
-"""What `episode_means` reads."""
 
 
 def episode_means(ends: TensorDictBase) -> NamedValues:
-    """Return the number of finished episodes, their mean return and length, and the shares at the goal and at any end.
+    """Return the count of episodes, their mean return and length, and the shares that reach the goal and any end.
 
-    Means are NaN without an episode. Shares are NaN for tasks other than CT-graphs.
+    Means are NaN without an episode; shares are NaN for other tasks than CT-graphs.
 
     Args:
-        ends: the data of the last step of each episode.
+        ends: data of the last step of each episode.
     """
     outcome = ends.get("outcome", None)
     return {
@@ -155,13 +153,13 @@ def episode_means(ends: TensorDictBase) -> NamedValues:
 
 
 def adaptation(rows: TensorDictBase, task: TaskLike) -> Iterator[NamedValues]:
-    """Yield the means over rows of their first episodes, of their second ones, and so on.
+    """Yield the means over rows of their first episodes, of their second ones, and onwards.
 
-    ``found_rate`` is the share of rows that have reached the goal by then, and ``exact_rate`` the success rate of the
-    best search for a goal that is drawn uniformly; NaN for tasks other than CT-graphs.
+    ``found_rate`` is the share of rows that have reached the goal by then, ``exact_rate`` that of the best search for a
+    uniformly drawn goal; NaN for other tasks than CT-graphs.
 
     Args:
-        rows: the data of the last step of each episode, [rows, episodes of a row].
+        rows: data of the last step of each episode, [rows, episodes of a row].
         task: what is played.
     """
     num_rows, num_steps = rows.shape
@@ -176,19 +174,19 @@ def adaptation(rows: TensorDictBase, task: TaskLike) -> Iterator[NamedValues]:
 
 
 def derive_seed(seed: int, *purpose: str | int) -> int:
-    """Return a seed in [0, 2**63) for a purpose, unrelated to the run's own and to other purposes'."""
+    """Return a seed in [0, 2**63) that is independent of the run's and of other purposes'."""
     text = "/".join(map(str, (seed, *purpose)))
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
 
 
 class Evaluator:
-    """Evaluates at the moments and in the way that a curriculum says, and appends the results to a log.
+    """Evaluates as a curriculum says, and appends the results to a log.
 
     Args:
         curriculum: says when and how.
-        seed: of the run; each evaluation derives its own.
+        seed: of the run; each evaluation derives one.
         log: where measurements are appended.
-        device: where the environments live.
+        device: of the environments.
     """
 
     def __init__(self, curriculum: Curriculum, seed: int, log: RunLog, device: torch.device | str = "cpu") -> None:
@@ -198,7 +196,7 @@ class Evaluator:
         self.device = device
 
     def evaluate_if_due(self, agent: Agent, frames: int) -> None:
-        """Evaluate an agent where the curriculum evaluates after ``frames`` frames of the run."""
+        """Evaluate an agent if the curriculum evaluates after ``frames`` frames of the run."""
         moment = self.curriculum.moment(frames)
         if moment is None:
             return
@@ -212,7 +210,7 @@ class Evaluator:
         self.evaluate(acts, frames, moment, agent.initial_state)
 
     def evaluate(self, policy: Policy, frames: int, moment: str, initial_state: InitialState | None = None) -> None:
-        """Evaluate a policy after ``frames`` frames and append one line for each task."""
+        """Evaluate a policy and append one line for each task."""
         tasks = self.tasks_at(frames)
         curriculum = self.curriculum
         if not tasks:
@@ -270,7 +268,7 @@ class Evaluator:
         )
 
     def tasks_at(self, frames: int) -> dict[TaskLike, tuple[int, str]]:
-        """Return the tasks that are evaluated after ``frames`` frames, with their numbers and labels."""
+        """Return the tasks to evaluate after ``frames`` frames, with their numbers and labels."""
         curriculum = self.curriculum
         evaluated = *curriculum.tasks, *curriculum.evaluation.held_out
         named = dict(zip(evaluated, enumerate(curriculum.evaluated_labels, 1), strict=True))
@@ -281,12 +279,12 @@ class Evaluator:
 
 
 def _join_policies(agent: Agent, policies: Sequence[Policy]) -> Policy:
-    """Return the agent's policy where it is that of each task, or else one that acts with each in its slice of rows."""
+    """Return the agent's policy if all tasks have it, else one that acts for each task in its slice of rows."""
     return agent.policy if all(policy is agent.policy for policy in policies) else by_slices(policies)
 
 
 def by_slices(policies: Sequence[Policy]) -> Policy:
-    """Return a policy that gives each of as many equal slices of the rows to one of the policies."""
+    """Return a policy that splits the rows into equal slices, one for each policy."""
 
     def act(data: TensorDictBase) -> TensorDictBase:
         slices = data.chunk(len(policies))

@@ -1,12 +1,12 @@
-"""Evaluation without episodes: the exact mean return, success rate, end rate and length of a policy on a CT-graph.
+"""Exact mean return, success rate, end rate and length of a policy on a CT-graph, without episodes.
 
-Without noise on reading, an agent can have seen only finitely many things. A policy without memory is a table with a
-row for each image, whose values follow by backward induction (`ctgraph_rl.tasks.values`). With memory, all histories
-are played at once, each with its probability. An action that fails ends an episode. So histories branch only at
-decisions, at waits and where images are drawn.
+Without noise on reading, an agent can have seen finitely many things. A policy without memory is a table with a row for
+each image; backward induction gives its values (`ctgraph_rl.tasks.values`). With memory, all histories are played at
+once, each with its probability. They branch only at decisions, at waits and where images are drawn, as an action that
+fails ends an episode.
 
-Where waits are drawn (p > 0), an episode may stay in a wait state for ever. Stays of a probability below `LEAST_STAY`
-are left out, which changes a success rate by less than (d + 1) times that.
+Where waits are drawn (p > 0), stays of a probability below `LEAST_STAY` are left out. This changes a success rate by
+less than (d + 1) times that.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from ctgraph_rl.tasks.task import Task, are_graphs
 from ctgraph_rl.tasks.values import Measures, policy_measures
 
 LEAST_STAY = 1e-12
-"""Probability of a stay in a wait state below which it is left out."""
+"""Probability below which a stay in a wait state is left out."""
 
 MOST_HISTORIES = 2**22
-"""Largest number of histories that are played; 10 s of an LSTM on one core."""
+"""Most histories that are played: 10 s of an LSTM on one core."""
 
 HISTORIES_AT_ONCE = 2**15
-"""Histories of one forward pass; more are played in turn."""
+"""Histories of one forward pass."""
 
 ActionProbs = Callable[[Tensor], Tensor]
 """Maps images, uint8 [n, *shape], to action probabilities, float [n, A], or to actions, int64 [n]."""
@@ -56,15 +56,15 @@ def exact_measures(
     shape: Sequence[int] | None = None,
     gamma: float = 1.0,
 ) -> Measures:
-    """Return the exact measures of a policy of TensorDicts on a task; torch's global generator is not used.
+    """Return the exact measures of a policy on a task, without torch's global generator.
 
     Args:
         policy: has ``action_probs``, see `ctgraph_rl.agent.Agent`.
         task: a CT-graph for which `exact_rules` hold.
-        greedy: of the most likely actions; False: of actions that are sampled and explore as in training.
-        initial_state: gives a recurrent policy's state for a number of rows; None or empty: it has no memory.
+        greedy: take the most likely actions; False samples and explores as in training.
+        initial_state: gives a recurrent policy's state for a number of rows; None or empty: no memory.
         task_id: one-hot, uint8 [num_task_ids], where the protocol shows ids.
-        shape: of observations, where vectors are padded to a longer one; None: the task's own.
+        shape: of observations, where vectors are padded; None: the task's.
         gamma: discount of the return, in [0, 1].
 
     Raises:
@@ -82,16 +82,15 @@ def exact_measures(
 
 
 def exact_success(policy: ActionProbs | nn.Module, task: Task) -> float:
-    """Return the probability that a policy without memory reaches the goal, without playing an episode.
+    """Return the probability that a policy without memory reaches the goal.
 
     Args:
-        policy: maps images, uint8 [n, \\*shape], to action probabilities, float [n, A], or to actions, int64 [n],
-            which are taken as deterministic. A plain module maps them to logits, which are sampled.
+        policy: maps images, uint8 [n, \\*shape], to action probabilities, float [n, A], or to actions, int64 [n], which
+            are deterministic. A plain module maps them to logits, which are sampled.
         task: a CT-graph without noise on reading.
 
     Raises:
-        ValueError: for noise on reading, a goal that changes, probabilities of a wrong shape, and rows of them that do
-            not sum to 1.
+        ValueError: for noise on reading, a changing goal, and probabilities of a wrong shape or sum.
 
     Example:
         >>> from ctgraph_rl.tasks.configurations import ct_su_b1
@@ -104,19 +103,19 @@ def exact_success(policy: ActionProbs | nn.Module, task: Task) -> float:
 
 @takes_numbers
 def exact_value(policy: ActionProbs | nn.Module, task: Task, gamma: float = 1.0) -> float:
-    """Return the expected discounted return of a policy without memory; arguments as `exact_success`.
+    """Return the expected discounted return of a policy without memory.
 
     Args:
-        policy: as there.
-        task: as there.
-        gamma: discount, in [0, 1]; with 1 the mean return.
+        policy: as in `exact_success`.
+        task: as in `exact_success`.
+        gamma: discount, in [0, 1]; 1 gives the mean return.
     """
     require(*fraction(gamma=gamma))
     return _measure_function(policy, task, gamma).return_mean
 
 
 def exact_rules(policy: object, task: TaskLike, start: Step) -> Iterator[Rule]:
-    """Yield the rules for exact measures: what of a policy and a task has none, and what to do.
+    """Yield what exact measures require of a policy and a task.
 
     Args:
         policy: what plays.
@@ -145,7 +144,7 @@ def exact_rules(policy: object, task: TaskLike, start: Step) -> Iterator[Rule]:
 
 
 def shown_id(curriculum: Curriculum, task: TaskLike) -> Tensor | None:
-    """Return the one-hot id of a task that observations show, uint8; zeros for a held-out one, None without ids."""
+    """Return the one-hot id that observations show, uint8; zeros for a held-out task, None without ids."""
     protocol = curriculum.protocol
     if protocol.task_id != "one_hot":
         return None
@@ -156,7 +155,7 @@ def shown_id(curriculum: Curriculum, task: TaskLike) -> Tensor | None:
 
 
 def count_histories(task: Task, reads_actions: bool) -> float:
-    """Return how many histories an agent with memory can have of an episode that does not fail; stays are cut."""
+    """Return how many histories of an episode without failure an agent with memory can have, without long stays."""
     graph = task.graph
     x = task.observations
     stays = _longest_stay(graph.wait_prob)
@@ -170,7 +169,7 @@ def count_histories(task: Task, reads_actions: bool) -> float:
 
 
 def _longest_stay(wait_prob: float) -> int:
-    """Return the steps in a wait state after which staying on has a probability below `LEAST_STAY`."""
+    """Return the steps in a wait state after which staying on is less likely than `LEAST_STAY`."""
     return 1 if wait_prob == 0 else 1 + math.ceil(math.log(LEAST_STAY) / math.log(wait_prob))
 
 
@@ -192,7 +191,6 @@ class _Function:
     num_actions: int
 
     def action_probs(self, data: Step) -> tuple[Tensor, Step]:
-        """Return action probabilities, and no state."""
         probs = self.function(data["observation"])
         is_tensor = isinstance(probs, Tensor) and len(probs) == len(data["observation"])
         acts = is_tensor and probs.dim() == 1 and not probs.is_floating_point()
@@ -205,11 +203,11 @@ class _Function:
 
 @dataclass(frozen=True)
 class _Shown:
-    """What a policy reads of a task: images, padded where others are longer, and the task's id.
+    """What a policy reads of a task.
 
     Args:
         task: what is played.
-        shape: of observations.
+        shape: of observations, to which images are padded.
         task_id: one-hot, or None.
     """
 
@@ -236,9 +234,9 @@ class _Shown:
 
 
 def _table(policy: Any, task: Task, shown: _Shown) -> Tensor:
-    """Return the action probabilities of each id, float64 [num_images, A]; those of ids that decide nothing are equal.
+    """Return action probabilities, float64 [num_images, A]: means over the views of an id.
 
-    Each observation draws a view of an id, so an id's probabilities are the mean over its views.
+    Those of ids that decide nothing are equal.
     """
     x = task.observations
     ids = torch.cat([torch.arange(first, last + 1, device="cpu") for first, last in (x.wait_ids, x.decision_ids)])
@@ -252,13 +250,13 @@ def _table(policy: Any, task: Task, shown: _Shown) -> Tensor:
 
 @dataclass
 class _Histories:
-    """Histories that have not ended, all in the same kind of state: ``node``, int64 [n], and what was seen of them.
+    """Histories that have not ended, all in the same kind of state.
 
     Args:
-        node: where they are.
-        weight: their probabilities, float64 [n].
+        node: where they are, int64 [n].
+        weight: probabilities, float64 [n].
         discount: gamma to the power of their steps, float64 [n].
-        state: the recurrent state of each.
+        state: recurrent states.
     """
 
     node: Tensor
@@ -273,14 +271,7 @@ class _Histories:
 
 
 class _Enumeration:
-    """All histories of a policy with memory, played depth first in parts of `HISTORIES_AT_ONCE`.
-
-    Args:
-        policy: has ``action_probs``.
-        task: what is played.
-        shown: what the policy reads of it.
-        gamma: discount of the return.
-    """
+    """All histories of a policy with memory, played depth first in parts of `HISTORIES_AT_ONCE`."""
 
     def __init__(self, policy: Any, task: Task, shown: _Shown, gamma: float) -> None:
         self.policy = policy
@@ -293,7 +284,7 @@ class _Enumeration:
         self.sums = Measures(0.0, 0.0, 0.0, 0.0)
 
     def measures(self, start: Step) -> Measures:
-        """Return the measures of all histories that begin with a recurrent state, of one row."""
+        """Return the measures of all histories that begin with a recurrent state of one row."""
         ones = torch.ones(1, dtype=torch.float64, device="cpu")
         self._at_home(_Histories(torch.zeros(1, dtype=torch.int64, device="cpu"), ones, ones, start))
         return self.sums
@@ -314,7 +305,7 @@ class _Enumeration:
             self._at_wait(self._after(seen, written, chance, action), 0)
 
     def _at_wait(self, histories: _Histories, level: int) -> None:
-        """Wait until that leads on; another action fails."""
+        """Wait until the next state; another action fails."""
         for part in _parts(histories):
             p = self.task.graph.wait_prob
             staying = part
@@ -354,7 +345,7 @@ class _Enumeration:
     def _act(
         self, histories: _Histories, kind: StateType, level: int, is_init: bool = False
     ) -> tuple[_Histories, Tensor, Step]:
-        """Return histories with each image that they may see, float64 [n, A] probabilities, and what was written."""
+        """Return the histories split by images, their action probabilities, float64 [n, A], and what was written."""
         x = self.task.observations
         first, last = x.ids(kind)
         views = _num_views(self.task)
@@ -374,7 +365,7 @@ class _Enumeration:
         return seen, probs.double(), written
 
     def _after(self, seen: _Histories, written: Step, chance: Tensor, action: int) -> _Histories:
-        """Return the histories that take an action, those that do so with probability 0 left out."""
+        """Return the histories that take an action with a probability over 0."""
         state = {}
         for key, value in seen.state.items():
             state[key] = written.get(("next", key), value)
@@ -395,7 +386,7 @@ class _Enumeration:
         self.sums.return_mean += self.task.fail_reward * (seen.weight * seen.discount * chance).sum().item()
 
     def _arrive(self, histories: _Histories) -> None:
-        """End all histories, which have just taken the step to their end states."""
+        """End all histories, which have just reached their end states."""
         graph = self.task.graph
         leaf = histories.node - graph.first_node(graph.depth)
         before = histories.discount / self.gamma if self.gamma else torch.zeros_like(histories.discount)

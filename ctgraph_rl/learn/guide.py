@@ -1,4 +1,4 @@
-"""A guide: a navigating policy that acts in an agent's place, less and less, so that first rewards are found."""
+"""A guide: a navigating policy that acts in an agent's place, less and less, until it finds rewards itself."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from ctgraph_rl.learn.collect import Policy
 from ctgraph_rl.policies import NavigationPolicy
 
 GUIDED_ACTION = "guided_action"
-"""The key of the actions that a policy must take where they are not negative, int64 [num_envs]."""
+"""Key of the actions that a policy must take where they are not negative, int64 [num_envs]."""
 
 
 GUIDED = "guided"
-"""The key that says which rows are in an episode that is guided."""
+"""Key that says which rows are in a guided episode."""
 
 
 def guided_share(frames: int, guide_frames: int) -> float:
-    """Return the share of episodes beginning after some frames that are guided: it falls linearly from 1 to 0."""
+    """Return the share of new episodes that are guided: it falls linearly from 1 to 0."""
     return max(0.0, 1 - frames / guide_frames) if guide_frames else 0.0
 
 
 class Guide:
     """A policy in whose place `NavigationPolicy` acts through a share of the episodes.
 
-    The agent learns from these actions as from its own: the policy writes all else, such as their probability. Draws
-    come from torch's global generator, and stop once the share is 0. ``guided``, bool [num_envs], says which rows are
-    in such an episode.
+    The agent learns from these actions as from its own, as the policy writes all else, such as their probability. Draws
+    come from torch's global generator and stop once the share is 0. ``guided``, bool [num_envs], marks rows in such an
+    episode.
 
     Args:
         policy: of the agent.
@@ -44,10 +44,10 @@ class Guide:
         self.frames = 0
 
     def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action`` and what else the policy writes.
+        """Write ``action`` and the policy's other outputs.
 
         Raises:
-            ValueError: if the policy did not take the actions that it was given.
+            ValueError: if the policy did not take the given actions.
         """
         share = guided_share(self.frames, self.guide_frames)
         if not share:

@@ -1,9 +1,8 @@
 """Histories: what an agent can have seen up to a frame, each found once in a batch.
 
-Without noise on reading, thousands of frames show a few images, and what an agent with memory has seen since an episode
-began is one of a few sequences: 26 in 8,192 frames of CT-SU-B1. Histories are numbered, and equal numbers are equal
-histories. A history continues one that is a step shorter, so all together are a tree. One that an earlier batch
-began starts from the stored state of its row.
+Without noise on reading, the histories of an episode are few: 26 in 8,192 frames of CT-SU-B1. Equal numbers are equal
+histories. A history continues one that is a step shorter, so they form a tree. One that an earlier batch began starts
+from its row's stored state.
 """
 
 from __future__ import annotations
@@ -18,11 +17,13 @@ from torch import Tensor
 from ctgraph_rl.core.kernel import is_traced
 
 NUM_TRIED = 64
-"""Of so many rows that lie apart it is looked first whether enough are equal."""
+"""Spaced rows that are compared first, to see whether enough are equal."""
 
 
 def can_branch(value: Tensor) -> bool:
-    """Return whether code may branch on values: a GPU would have to wait for them, and a stack of seeds has many."""
+    """Return whether code may branch on values: not on a GPU, which would wait, nor in a stack of seeds, which has
+    many.
+    """
     return value.is_cpu and not is_traced()
 
 
@@ -31,7 +32,7 @@ def distinct(values: Sequence[Tensor], most: float = 1.0) -> tuple[Tensor, Tenso
 
     Args:
         values: tensors, [num_rows, ...] each.
-        most: the largest number of groups for which it pays, as a share of the rows, at most 1.
+        most: most groups for which it pays, as a share of the rows, at most 1.
 
     Returns:
         One row of each group, int64 [num_groups], and the group of each row, int64 [num_rows]. Each row is a group
@@ -55,7 +56,7 @@ def distinct(values: Sequence[Tensor], most: float = 1.0) -> tuple[Tensor, Tenso
 
 
 def renumber(numbers: Tensor) -> tuple[Tensor, Tensor]:
-    """Return what `distinct` does of rows whose groups have numbers already, from 0, int64 [num_rows]."""
+    """Return what `distinct` does of rows with numbered groups, from 0, int64 [num_rows]."""
     present = numbers.bincount() > 0
     groups = present.cumsum(0).index_select(0, numbers) - 1
     rows = torch.arange(len(numbers), device="cpu")
@@ -63,12 +64,12 @@ def renumber(numbers: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def number_histories(inputs: Tensor, starts: Tensor, state: Sequence[Tensor]) -> Tensor:
-    """Number the histories that end at the frames of a batch, int64 [rows, steps]; the shortest have the first numbers.
+    """Number the histories at the frames of a batch, int64 [rows, steps]; the shortest come first.
 
     Args:
-        inputs: a number for the inputs of each frame, from 0, the same where they are equal, int64 [rows, steps].
+        inputs: numbers of each frame's inputs, from 0, equal where they are, int64 [rows, steps].
         starts: where an episode starts, bool [rows, steps].
-        state: of each row before its first step, [rows, ...] each; it counts where no episode starts there.
+        state: of each row before its first step, [rows, ...] each; unused where an episode starts there.
     """
     flat = inputs.flatten()
     num_inputs = int(flat.max()) + 1
@@ -97,13 +98,13 @@ class Tree(NamedTuple):
     """What each continues: its place among the states of `initial`, followed by the histories; int64."""
 
     sizes: list[int]
-    """How many histories there are of each length."""
+    """Histories of each length."""
 
     of_frames: Tensor
     """The history of each frame, int64 [rows * steps]."""
 
     def initial(self, starts: Tensor, state: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """Return the states that histories of length 1 continue; arguments as of `number_histories`."""
+        """Return the states that histories of length 1 continue; arguments as `number_histories`."""
         frames = self.frames[: self.sizes[0]]
         goes_on = ~starts.flatten().index_select(0, frames)
         rows = frames // starts.shape[1]
@@ -112,7 +113,7 @@ class Tree(NamedTuple):
 
 
 def tree(numbers: Tensor, starts: Tensor) -> Tree:
-    """Return the histories of rows of a batch, from what `number_histories` returned for them, int64 [rows, steps]."""
+    """Return the histories of a batch from the result of `number_histories`, int64 [rows, steps]."""
     frames, of_frames = renumber(numbers.flatten())
     sizes = _lengths(starts).index_select(0, frames).bincount().tolist()
     first = torch.arange(sizes[0], device="cpu")
@@ -121,7 +122,7 @@ def tree(numbers: Tensor, starts: Tensor) -> Tree:
 
 
 def _lengths(starts: Tensor) -> Tensor:
-    """Return the steps of each frame since its episode started or, if that was earlier, since the first step."""
+    """Return the steps of each frame since its episode or the batch started."""
     time = torch.arange(starts.shape[1], device="cpu")
     return (time - torch.where(starts, time, 0).cummax(dim=1).values).flatten()
 
@@ -140,12 +141,12 @@ def _words(values: Sequence[Tensor]) -> Tensor:
 
 
 def _sums(words: Tensor) -> Tensor:
-    """Return a number for each row, int64 [num_rows], that is nearly always another where a bit is."""
+    """Return a hash of each row, int64 [num_rows]."""
     return ((words ^ (words >> 32)) * _weights(words.shape[1])).sum(dim=1)
 
 
 @cache
 def _weights(count: int) -> Tensor:
-    """Return random odd numbers, int64 [count], always the same."""
+    """Return fixed random odd numbers, int64 [count]."""
     generator = torch.Generator(device="cpu").manual_seed(0)
     return torch.randint(-(2**62), 2**62, [count], generator=generator, dtype=torch.int64, device="cpu") | 1

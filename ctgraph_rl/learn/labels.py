@@ -1,4 +1,4 @@
-"""Labels that a learner gives to tasks itself: which one stands for a task where that is evaluated."""
+"""Labels that a learner gives to tasks itself, and which one stands for a task in evaluation."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ from ctgraph_rl.tasks.kinds.task_like import TaskLike
 def task_labels(log: RunLog, curriculum: Curriculum) -> dict[int, int]:
     """Return the label that acted in most frames of each task so far, by the task's position.
 
-    Each task of a block with several counts with an equal share of its frames. The learner knows nothing of this:
-    only evaluation uses it, as an oracle.
+    Tasks of a block share its frames equally. Only evaluation uses this, as an oracle; the learner does not see it.
     """
     acted, blocks, ends = (log.training(name).tolist() for name in ("acted_label", "block", "frames"))
     starts = [0.0, *ends]
@@ -42,7 +41,7 @@ class Span(NamedTuple):
 
 
 def label_spans(log: RunLog) -> tuple[Span, ...]:
-    """Return the spans of labels of a run in time order; empty unless the learner labels tasks itself."""
+    """Return the label spans of a run in time order; empty unless the learner labels tasks."""
     spans: list[Span] = []
     for m in log.of_kind("training"):
         if m.get("acted_label") is None:
@@ -58,17 +57,17 @@ def label_spans(log: RunLog) -> tuple[Span, ...]:
 def task_policies(
     agent: Any, curriculum: Curriculum, log: RunLog, tasks: Iterable[TaskLike], frames: int | None = None
 ) -> list[TensorDictModuleBase]:
-    """Return an agent's policy for each task: the one for its id where ids are shown, else the same for all.
+    """Return an agent's policy for each task: the one for its id where ids are shown, else one for all.
 
-    An agent that labels tasks itself has ``policy_for_label``, which is asked for the task's most frequent label.
+    An agent that labels tasks has ``policy_for_label``, which gets the task's most frequent label.
 
     Args:
         agent: what learns.
         curriculum: what it learns.
         log: of the run so far.
-        tasks: what is played. One that is not trained has no id and no label, and is played with `Agent.policy`.
-        frames: of the run so far, while it lasts: the present task may have started after the log's last interval, and
-            then has the label that acts.
+        tasks: what is played. An untrained one has no id and no label, and is played with `Agent.policy`.
+        frames: of the run so far, while it lasts. If the present task started after the log's last interval, it has the
+            label that acts.
     """
     if hasattr(agent, "policy_for_label"):
         labels = task_labels(log, curriculum)

@@ -1,4 +1,4 @@
-"""Lifelong learning: an agent learns the blocks of a curriculum in order, evaluated at the moments that it says."""
+"""Lifelong learning: an agent learns and is evaluated as a curriculum says."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 OfferCheckpoint = Callable[[Callable[[], NamedValues], bool], object]
-"""Takes a function that makes the run's state, and whether a block ends here; saves the state if it is time."""
+"""Takes a function that makes the run's state, and whether a block ends here; saves the state if due."""
 
 
 @takes_numbers
@@ -34,26 +34,26 @@ def learn_curriculum(
 
     The environment draws from streams of ``seed``, the agent from torch's global generator, which the caller seeds.
     Evaluation disturbs neither. A batch ends with its block where boundaries are announced, and may hold frames of two
-    where they are hidden. An environment that cannot be saved within an episode offers its state to ``checkpoint`` at
+    where they are hidden. An environment that cannot be saved within an episode offers ``checkpoint`` its state at
     announced boundaries only.
 
     Args:
         curriculum: what to learn.
         agent: the learner.
-        seed: the environment's seed, in [0, 2**63).
+        seed: of the environment, in [0, 2**63).
         log: where measurements are appended; default: a new one in memory.
-        progress: is updated after every batch; True: a bar on a terminal and in a notebook, lines elsewhere.
-        device: where the environment lives.
-        saved: a state that ``checkpoint`` was given, to resume from with the same bits. The agent is built as it was,
-            and the log holds what it held then.
+        progress: updated after every batch; True: a bar on a terminal and in a notebook, lines elsewhere.
+        device: of the environment.
+        saved: a state that ``checkpoint`` was given, to resume with the same bits. The agent is built the same way, and
+            the log holds what it held then.
         checkpoint: is offered the state after every batch.
 
     Returns:
         The log; ``log.performance()`` is the performance matrix.
 
     Raises:
-        ValueError: before any work, if frames are not a multiple of the agent's environments, or it reads task ids that
-            are not shown.
+        ValueError: before any work, if frames are not a multiple of the agent's environments, or it reads hidden task
+            ids.
         FloatingPointError: if a loss or weight is not finite; names it, block and frames.
 
     Example:

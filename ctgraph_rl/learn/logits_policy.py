@@ -19,11 +19,11 @@ from ctgraph_rl.learn.collect import Policy, Step
 
 
 class LogitsPolicy:
-    """A plain module that maps observations to logits, as a policy: greedy, or sampling where exploration is on.
+    """A plain module that maps observations to logits: greedy, or sampling where exploration is on.
 
-    The module gets observations as the environment shows them, 0 to 255 for images, in the type and on the device of
-    its first parameter. It acts in evaluation mode. Where the protocol shows task ids and its ``forward`` needs two
-    arguments, or names the second one ``task_id``, the one-hot task ids are the second.
+    The module gets observations unscaled, 0 to 255 for images, in the type and on the device of its first parameter. It
+    acts in evaluation mode. One-hot task ids, if the protocol shows them, are the second argument of a ``forward`` that
+    needs two or names the second ``task_id``.
 
     Args:
         module: maps float [n, 1, r, r] or [n, K] to float [n, num_actions].
@@ -43,7 +43,7 @@ class LogitsPolicy:
         return data.set("action", action.to(data.device or "cpu"))
 
     def action_probs(self, data: Step) -> tuple[Tensor, Step]:
-        """Return the probabilities of actions, float [n, num_actions], and no state; see `ctgraph_rl.agent.Agent`."""
+        """Return action probabilities, float [n, num_actions], and no state, as `ctgraph_rl.agent.Agent`."""
         logits = self._logits(data)
         if exploration_type() == ExplorationType.DETERMINISTIC:
             return one_hot(logits.argmax(-1), self.num_actions).to(logits.dtype), {}
@@ -87,14 +87,13 @@ def _takes_ids(function: Any) -> bool:
 
 
 def positional_parameters(function: Any) -> list[Parameter]:
-    """Return the positional_parameters parameters of a function."""
+    """Return the positional parameters of a function."""
     kinds = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
     return [parameter for parameter in signature(function).parameters.values() if parameter.kind in kinds]
 
 
 @contextmanager
 def _evaluation_mode(module: nn.Module) -> Iterator[None]:
-    """Let a module compute in evaluation mode, then restore its mode."""
     training = [each for each in module.modules() if each.training]
     module.eval()
     try:
@@ -105,7 +104,7 @@ def _evaluation_mode(module: nn.Module) -> Iterator[None]:
 
 
 def as_policy(policy: Policy | nn.Module, num_actions: int | None) -> Policy:
-    """Return a plain module as a policy of TensorDicts; what is one already unchanged."""
+    """Return a plain module as a policy of TensorDicts, and a policy unchanged."""
     plain = isinstance(policy, nn.Module) and not isinstance(policy, TensorDictModuleBase)
     if not plain:
         return policy

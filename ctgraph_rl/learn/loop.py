@@ -1,7 +1,7 @@
 """The loop over curricula: members learn in lock-step, a batch each, and one object couples them.
 
-A single run is one member. Seeds that are stacked are several members of one `Lockstep`: they share an environment and
-learn as one. Learners that exchange messages are a `Lockstep` each, and `ctgraph_rl.learn.collective` couples them.
+A single run is one member. Stacked seeds are members of one `Lockstep`, which share an environment. Learners that
+exchange messages are a `Lockstep` each, coupled by `ctgraph_rl.learn.collective`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ SavedState = ReadOnlyValues
 
 
 Learnt = dict[str, float] | FloatingPointError
-"""What an agent measured while it learned from a batch, or the error that names what is not finite."""
+"""What an agent measured on a batch, or the error that names what is not finite."""
 
 
 class Progress(Protocol):
@@ -43,7 +43,7 @@ class Progress(Protocol):
 
 
 class Coupling(Protocol):
-    """What lets members learn from a batch each: a `Lockstep`, or several that exchange messages."""
+    """Members that learn a batch each: a `Lockstep`, or several that exchange messages."""
 
     @property
     def frames(self) -> int:
@@ -51,7 +51,7 @@ class Coupling(Protocol):
         ...
 
     def advance(self) -> bool:
-        """Let each member learn from its next batch; False where none is left."""
+        """Let each member learn from its next batch; False at the end."""
         ...
 
     @property
@@ -66,23 +66,23 @@ class Coupling(Protocol):
 
     @property
     def is_at_block_end(self) -> bool:
-        """Whether a block of a member ends with the last batch."""
+        """Whether a member's last batch ends a block."""
         ...
 
     @property
     def can_resume(self) -> bool:
-        """Whether a run can resume from this state as if it had not stopped."""
+        """Whether a run can resume from this state with the same bits."""
         ...
 
     def state(self) -> Any:
-        """Return what a resumed run needs, as tensors and plain values, until the next batch is collected."""
+        """Return what a resumed run needs, as tensors and plain values; valid until the next batch."""
         ...
 
 
 class Group(Protocol):
     """Learners that act and learn as one, such as `Alone` and `baselines.update.seeds.SeedGroup`.
 
-    Between two calls each agent is as if no other had learned beside it.
+    Between two calls each agent is unaffected by the others.
     """
 
     @property
@@ -92,7 +92,7 @@ class Group(Protocol):
 
     @property
     def generators(self) -> Sequence[torch.Generator] | None:
-        """What each agent draws from; None for one agent that draws from torch's global generator."""
+        """What each agent draws from; None: torch's global generator, for one agent."""
         ...
 
     @property
@@ -102,31 +102,27 @@ class Group(Protocol):
 
     @property
     def policy(self) -> Policy:
-        """Writes the actions of all rows, [agents * num_envs], those of an agent one after the other."""
+        """Writes the actions of all rows, [agents * num_envs]; those of an agent are adjacent."""
         ...
 
     def start_task(self, task: int | None = None) -> None:
-        """See `ctgraph_rl.agent.Agent`."""
+        """Begin a task, as `ctgraph_rl.agent.Agent`."""
         ...
 
     def end_task(self) -> None:
-        """See `ctgraph_rl.agent.Agent`."""
+        """End a task, as `ctgraph_rl.agent.Agent`."""
         ...
 
     def learn(self, batch: TensorDictBase) -> Sequence[Learnt]:
         """Learn from a batch, [agents * num_envs, num_steps]; return what each agent measured, or raised.
 
-        An agent that raised gets batches as before. Neither then nor later does it change a bit of another's.
+        An agent that raised still gets batches and never changes a bit of another's.
         """
         ...
 
 
 class Alone:
-    """A group of one learner.
-
-    Args:
-        agent: the learner.
-    """
+    """A group of one learner."""
 
     generators = device_generators = None
 
@@ -135,19 +131,19 @@ class Alone:
 
     @property
     def policy(self) -> Policy:
-        """See `Group`."""
+        """The agent's policy."""
         return self.agents[0].policy
 
     def start_task(self, task: int | None = None) -> None:
-        """See `Group`."""
+        """Start a task of the agent."""
         self.agents[0].start_task(task)
 
     def end_task(self) -> None:
-        """See `Group`."""
+        """End a task of the agent."""
         self.agents[0].end_task()
 
     def learn(self, batch: TensorDictBase) -> list[Learnt]:
-        """See `Group`."""
+        """Let the agent learn, or return what it raised."""
         try:
             return [self.agents[0].learn(batch)]
         except FloatingPointError as error:
@@ -157,15 +153,15 @@ class Alone:
 class Lockstep:
     """Members that learn one curriculum as one, batch by batch.
 
-    A member with a loss or weight that is not finite has failed: it measures nothing from then on.
+    A member with a loss or weight that is not finite has failed and measures nothing from then on.
 
     Args:
         curriculum: what is learned.
         group: the learners.
         seeds: of each.
-        logs: where the measurements of each are appended.
-        device: where the environment lives.
-        saved: the state of each that `state` returned, to resume from; None: from the beginning.
+        logs: where each appends its measurements.
+        device: of the environment.
+        saved: what `state` returned, to resume from; None: the beginning.
 
     Raises:
         ValueError: for a curriculum that the learners cannot learn.
@@ -194,7 +190,7 @@ class Lockstep:
         self.evaluators = [Evaluator(curriculum, seed, log, device) for seed, log in zip(seeds, logs, strict=True)]
         self.frames: int = 0 if saved is None else saved[0]["frames"]
         self.failed: dict[int, FloatingPointError] = {}
-        """The error of each member that failed, by its position."""
+        """Errors of failed members by their position."""
 
         for number, state in enumerate(saved or ()):
             if "failed" in state:
@@ -222,7 +218,7 @@ class Lockstep:
         return env
 
     def close(self) -> None:
-        """Close the environment; nothing is learned after it."""
+        """Close the environment."""
         close_env(self.env)
 
     @property
@@ -276,7 +272,6 @@ class Lockstep:
             self._evaluate(self.frames)
 
     def _evaluate(self, frames: int) -> None:
-        """Evaluate those that have not failed, where the curriculum evaluates after ``frames`` frames."""
         for number, (evaluator, agent) in enumerate(zip(self.evaluators, self.group.agents, strict=True)):
             if number not in self.failed:
                 evaluator.evaluate_if_due(agent, frames)
@@ -378,7 +373,7 @@ def _require_finite(measured: Learnt) -> dict[str, float]:
     """Return what was measured.
 
     Raises:
-        FloatingPointError: what was raised in place of it, or names what is not finite.
+        FloatingPointError: the error in its place, or one that names what is not finite.
     """
     if isinstance(measured, FloatingPointError):
         raise measured

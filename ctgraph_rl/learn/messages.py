@@ -1,7 +1,7 @@
-"""Messages between learners: what they may hold is checked, and some are lost or late, by a separate random stream.
+"""Messages between learners: their contents are checked, and a separate random stream loses or delays some.
 
-A message holds tensors and numbers by name. A receiver refuses one whose kind, names, shapes or values are not those
-that its exchange states, and counts it.
+A message holds tensors and numbers by name. A receiver refuses and counts one whose kind, names, shapes or values its
+exchange does not state.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ctgraph_rl.checks import LARGEST_INT, NamedValues, ReadOnlyValues, fraction
 BYTES_OF_A_NUMBER = 8
 
 SENT, DROPPED, DELAYED, DELIVERED, REFUSED = "sent", "dropped", "delayed", "delivered", "refused"
-"""What is counted of the messages of a kind; a delayed one is also delivered or refused, later."""
+"""What is counted by kind of message; a delayed one is later also delivered or refused."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Number(NamedTuple):
     whole: bool = False
 
     def why_not(self, value: Any) -> str | None:
-        """Return what is wrong with a value; None if nothing is."""
+        """Return what is wrong with a value, if anything."""
         is_number = is_int if self.whole else is_real
         if not is_number(value):
             return f"no finite {'integer' if self.whole else 'number'}"
@@ -70,7 +70,7 @@ class Array(NamedTuple):
     dtype: torch.dtype = torch.float32
 
     def why_not(self, value: Any) -> str | None:
-        """Return what is wrong with a value; None if nothing is."""
+        """Return what is wrong with a value, if anything."""
         if not isinstance(value, Tensor):
             return "no tensor"
         if tuple(value.shape) != self.shape or value.dtype != self.dtype:
@@ -89,7 +89,7 @@ def why_refused(message: Message, kinds: Mapping[str, Fields]) -> str | None:
 
     Args:
         message: what was received.
-        kinds: the fields of each kind of message that the receiver knows.
+        kinds: the fields of each kind that the receiver knows.
     """
     fields = kinds.get(message.kind)
     if fields is None:
@@ -104,14 +104,14 @@ def why_refused(message: Message, kinds: Mapping[str, Fields]) -> str | None:
 
 
 class Mail:
-    """Takes messages to their receivers; each is lost or late with a stated probability, independently of all others.
+    """Takes messages to their receivers; each is independently lost or late with a stated probability.
 
-    A late message arrives at the next exchange. Two numbers are drawn for each message, whatever the probabilities are.
+    A late message arrives at the next exchange. Each message makes two draws, whatever the probabilities.
 
     Args:
         drop_prob: probability that a message is lost.
         delay_prob: probability that one which is not lost is late.
-        seed: decides which.
+        seed: of the draws.
 
     Raises:
         ValueError: for probabilities outside [0, 1].
@@ -128,10 +128,10 @@ class Mail:
         """Messages by kind and by what happened to them, since the last `begin`."""
 
         self.bytes: Counter[str] = Counter()
-        """Bytes that were sent by kind of message, since the last `begin`."""
+        """Bytes sent by kind of message, since the last `begin`."""
 
     def begin(self) -> None:
-        """Begin an exchange: what was late at the last one is here, and counts start at zero."""
+        """Begin an exchange: late messages of the last one arrive, and counts start at zero."""
         self.here = [*self.here, *self.late]
         self.late = []
         self.counts.clear()
@@ -153,11 +153,11 @@ class Mail:
     def take(
         self, receiver: int, kind: str, kinds: Mapping[str, Fields]
     ) -> tuple[list[Message], list[tuple[Message, str]]]:
-        """Return what a receiver has got of a kind: what it may use, and what it refuses with the reason.
+        """Return the messages that a receiver may use, and those that it refuses, with the reason.
 
         Args:
             receiver: number of a learner.
-            kind: messages of this kind, and of kinds that are unknown.
+            kind: messages of this kind, and of unknown kinds.
             kinds: the fields of each known kind.
         """
         good = []
@@ -177,7 +177,7 @@ class Mail:
         return good, refused
 
     def state_dict(self) -> NamedValues:
-        """Return the random stream and the late messages, as tensors and plain values."""
+        """Return the random stream and the late messages."""
         return {"random": self.generator.get_state(), "late": list(map(_as_plain, self.late))}
 
     def load_state_dict(self, state: ReadOnlyValues) -> None:

@@ -18,7 +18,7 @@ QUICK = 2.0
 """Seconds in which a command shows nothing."""
 
 Count = Callable[[str, int, int], object]
-"""Is called with the name of steps, how many are done and how many there are."""
+"""Takes the name of steps, how many are done and how many there are."""
 
 
 def silent(what: str, done: int, total: int) -> None:
@@ -26,7 +26,7 @@ def silent(what: str, done: int, total: int) -> None:
 
 
 class TextBar:
-    """A bar with a text beside it, for a terminal, and lines of text for other places.
+    """A bar with a text on a terminal, and lines of text elsewhere.
 
     Args:
         console: where they show; default: standard error.
@@ -46,7 +46,7 @@ class TextBar:
 
 
 class StepCounter(TextBar):
-    """Shows steps done, rate and time left on standard error once `QUICK` seconds have passed; a context manager.
+    """A context manager that shows steps done, rate and time left once `QUICK` seconds have passed.
 
     Args:
         console: where it shows; default: standard error.
@@ -66,7 +66,7 @@ class StepCounter(TextBar):
             self._bar.stop()
 
     def __call__(self, what: str, done: int, total: int) -> None:
-        """Count a step, see `Count`."""
+        """Show progress, as a `Count`."""
         if what != self._what:
             self._what = what
             self._start = self._now
@@ -84,13 +84,13 @@ class StepCounter(TextBar):
 
 
 class ProgressBar(TextBar):
-    """Shows block, frames, rate, return and time left on standard error; use it as a context manager.
+    """A context manager that shows block, frames, rate, return and time left.
 
     Args:
         num_blocks: blocks of the run.
         num_frames: frames of the run.
         console: where it shows; default: standard error.
-        done: frames that were learned before the run was resumed.
+        done: frames learned before the run was resumed.
     """
 
     def __init__(self, num_blocks: int, num_frames: int, console: Console | None = None, done: int = 0) -> None:
@@ -119,7 +119,7 @@ class ProgressBar(TextBar):
         return f"resumed after {_short(self.done)} frames" if self.done else "evaluating before training"
 
     def update(self, block: int, frames: int, episode_return: float) -> None:
-        """See `ctgraph_rl.learn.loop.Progress`."""
+        """Show the bar or line after a batch."""
         now = time.perf_counter()
         text = self.describe(block, frames, episode_return, now - self._start)
         if self._live:
@@ -140,7 +140,7 @@ class ProgressBar(TextBar):
 
 
 def _short(number: float) -> str:
-    """A count with at most four digits: 960, 20.48k, 819.2k, 1.638M."""
+    """A count with at most four digits: 960, 20.48k, 1.638M."""
     for unit, size in (("M", 1e6), ("k", 1e3)):
         if number >= size:
             return f"{number / size:.4g}{unit}"

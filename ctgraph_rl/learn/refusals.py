@@ -1,4 +1,4 @@
-"""What is refused of a curriculum and an agent before any work, and what one should know before it begins."""
+"""What is refused of a curriculum and an agent before any work, and notes on what begins."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from ctgraph_rl.tasks.task import Task
 
 
 def check_rows(curriculum: Curriculum, num_envs: int) -> None:
-    """Refuse a curriculum whose blocks cannot be learned in whole steps of ``num_envs`` rows.
+    """Refuse a curriculum whose blocks are not whole steps of ``num_envs`` rows.
 
     Raises:
-        ValueError: names the block and the nearest possible numbers of frames, or the tasks that cannot share the rows.
+        ValueError: names the block and the nearest possible frames, or the tasks that cannot share the rows.
     """
     evaluation = curriculum.evaluation
     evaluation.check((*curriculum.tasks, *evaluation.held_out))
@@ -36,7 +36,7 @@ def check_rows(curriculum: Curriculum, num_envs: int) -> None:
 
 
 def resumes(curriculum: Curriculum) -> bool:
-    """Return whether environments of all tasks can be saved within an episode; see `TaskLike`."""
+    """Return whether environments of all tasks can be saved within an episode."""
     return all(getattr(task, "resumes", False) for task in curriculum.tasks)
 
 
@@ -57,7 +57,7 @@ def check_env(curriculum: Curriculum, env: EnvBase) -> None:
 
 
 def check_ids(curriculum: Curriculum, agent: Agent) -> None:
-    """Refuse an agent that was made for task ids in its observations where the curriculum shows none."""
+    """Refuse an agent made for task ids where the curriculum shows none."""
     reads = "task_id" in (getattr(agent.policy, "in_keys", None) or ())
     shows = curriculum.protocol.task_id == "one_hot"
     message = f"{type(agent).__name__} reads task ids, which {curriculum.name} does not show"
@@ -82,12 +82,12 @@ def check_exact(curriculum: Curriculum, agent: Agent) -> None:
 
 
 def check_adaptation(curriculum: Curriculum, agent: Agent) -> None:
-    """Refuse an agent that adapts where a curriculum has nothing to adapt to, or too few episodes or steps for it.
+    """Refuse an agent that adapts where it has nothing to adapt to, or too few episodes or steps.
 
     Args:
         curriculum: what is learned.
-        agent: one with a member ``adapt_episodes`` adapts to a row's task after so many of its episodes. One that
-            ``needs_whole_trials`` learns nothing from trials of ``trial_episodes`` that a batch cuts.
+        agent: with ``adapt_episodes`` it adapts to a row's task after so many of its episodes. With
+            ``needs_whole_trials`` it learns nothing from trials of ``trial_episodes`` that a batch cuts.
     """
     needed = getattr(agent, "adapt_episodes", 0)
     if not needed:
@@ -114,7 +114,7 @@ def check_adaptation(curriculum: Curriculum, agent: Agent) -> None:
 
 
 def notes(curriculum: Curriculum) -> Iterator[str]:
-    """Yield what one should know of a curriculum before it is learned."""
+    """Yield what to know of a curriculum before a run."""
     rewards = {type(task.reward_fn) for task in curriculum.tasks if isinstance(task, Task)}
     slow = sorted(kind.__name__ for kind in rewards - {*KERNEL_REWARDS})
     if slow:

@@ -1,4 +1,4 @@
-"""What lies between two announced boundaries of a curriculum: its batches, and the lines that they leave in a log."""
+"""Segments of a curriculum between announced boundaries: their batches, and the lines that they log."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Segment(NamedTuple):
 
 
 def segments(curriculum: Curriculum, frames: int) -> Iterator[Segment]:
-    """Yield the segments that end after ``frames`` frames of the run, or right there."""
+    """Yield the segments that end at or after ``frames`` frames of the run."""
     start = 0
     for blocks in curriculum.segments:
         segment = Segment(start, blocks)
@@ -53,17 +53,17 @@ def collect_segment(
     num_seeds: int = 1,
     guide_frames: int = 0,
 ) -> Iterator[tuple[TensorDictBase, TensorDictBase]]:
-    """Yield the batches of a segment, each with the data that the next step starts from.
+    """Yield the batches of a segment, each with the data of the next step.
 
     Args:
         segment: what is learned; its frames are those of one seed.
         env: has the rows of all seeds.
-        agent: says how many steps a batch has, and the recurrent state that rows begin with.
+        agent: says how many steps a batch has, and the first recurrent state.
         evaluate: called between two steps with the frames of the run so far.
         policy: acts in all rows.
         done: frames of the segment that were learned before.
-        restore: restores a state between two batches of this segment, and returns the data of the next step.
-        num_seeds: seeds whose rows the environment has, equally many of each.
+        restore: restores a state between two batches, and returns the data of the next step.
+        num_seeds: seeds that share the rows equally.
         guide_frames: see `ctgraph_rl.tasks.protocol.Protocol`; only with one seed.
     """
     ends = list(accumulate(block.num_frames for block in segment.blocks))
@@ -103,14 +103,14 @@ def _set_tasks(env: EnvBase, block: Block, num_seeds: int, at_episode_end: bool 
 
 
 def announced_id(curriculum: Curriculum, block: Block) -> int | None:
-    """Return the task id that the agent gets at the announced start of a block of one task, unless ids are hidden."""
+    """Return the task id announced at the start of a block of one task, unless ids are hidden."""
     how = curriculum.protocol
     known = how.task_id != "hidden" and how.announces and len(set(block.tasks)) == 1
     return curriculum.task_ids[block.tasks[0]] if known else None
 
 
 def guided(frames: int, curriculum: Curriculum) -> dict[str, float]:
-    """Return the share of new episodes that was guided when a batch began; nothing without a guide."""
+    """Return the guided share of new episodes when a batch began; empty without a guide."""
     guide_frames = curriculum.protocol.guide_frames
     return {"guided_share": guided_share(frames, guide_frames)} if guide_frames else {}
 
@@ -132,7 +132,7 @@ def log_training(
         batch: [rows, steps].
         start: frames before it.
         measurements: of the batch.
-        events: names of measurements of the batch's end, which are 0 in its other parts.
+        events: names of measurements of the batch's end, 0 in its other parts.
     """
     frames = start
     end = start + batch.numel()
@@ -148,7 +148,7 @@ def log_training(
 
 
 def _split_at_ends(batch: TensorDictBase, start: int, ends: Sequence[int]) -> Iterator[TensorDictBase]:
-    """Cut a batch that begins after ``start`` frames where blocks end within it."""
+    """Cut a batch that begins after ``start`` frames where blocks end."""
     rows, steps = batch.shape
     first = bisect_right(ends, start)
     last = bisect_left(ends, start + batch.numel())

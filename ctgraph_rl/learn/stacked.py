@@ -19,7 +19,7 @@ OfferCheckpoints = Callable[[Callable[[], list[NamedValues]], bool], object]
 
 
 def why_not_together(curriculum: Curriculum) -> str | None:
-    """Return why seeds cannot learn a curriculum in one environment; None if they can."""
+    """Return why seeds cannot learn a curriculum in one environment, if they cannot."""
     kind = type(curriculum.tasks[0]).__name__
     if not are_graphs(curriculum.tasks):
         return f"the rows of {kind} cannot draw from the streams of several seeds, as those of CT-graphs can"
@@ -43,21 +43,21 @@ def learn_together(
 ) -> dict[int, FloatingPointError]:
     """Let agents with different seeds learn a curriculum as `learn_curriculum` lets one.
 
-    Each seed has the rows, generator, evaluations and log of a single run and differs from it by rounding. A
-    seed with a loss or weight that is not finite has failed: it measures nothing from then on; the others learn on.
+    Each seed has the rows, generator, evaluations and log of a single run and differs from it by rounding. One with a
+    loss or weight that is not finite has failed and measures nothing from then on.
 
     Args:
-        curriculum: what to learn; `why_not_together` has no objection.
+        curriculum: one for which `why_not_together` has no objection.
         group: the learners.
         seeds: of each agent.
-        logs: where the measurements of each are appended.
-        progress: is updated after every batch with the mean return of all seeds.
-        device: where the environment lives.
-        saved: the states of all seeds that ``checkpoint`` was given, to resume from with the same bits.
+        logs: where each appends its measurements.
+        progress: updated after every batch with the mean return of all seeds.
+        device: of the environment.
+        saved: all states that ``checkpoint`` was given, to resume with the same bits.
         checkpoint: is offered the states after every batch.
 
     Returns:
-        The error of each seed that failed, by its position in ``seeds``; names the seed, the block and the frames.
+        The error of each failed seed by its position in ``seeds``; names the seed, block and frames.
 
     Raises:
         ValueError: before any work, as `learn_curriculum` does.
