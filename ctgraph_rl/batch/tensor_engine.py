@@ -40,6 +40,7 @@ class DrawsAhead:
         self._tick: Tensor | None = None
 
     def serve(self, params: RowParams, uses: Uses) -> bool:
+        """Return whether rows with other parameters have the same draws."""
         own = self._params
         return params.seed is own.seed and params.row is own.row and uses is self._uses
 
@@ -49,6 +50,7 @@ class DrawsAhead:
         self._now = words
 
     def now(self, tick: Tensor) -> Words:
+        """Return the draws of the rows' present ticks."""
         if tick is not self._tick:  # they were moved by others
             self._left = 0
             self.move(tick, self._at(tick, tick))
