@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -14,7 +14,7 @@ from baselines.methods.parts.masks import Masks
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, TakesNumbers, at_least_one, fraction, require
 from ctgraph_rl.learn.collective import Help
-from ctgraph_rl.learn.messages import Fields, Message
+from ctgraph_rl.learn.messages import Message
 
 
 class Exchange(TakesNumbers):
@@ -36,7 +36,7 @@ class Exchange(TakesNumbers):
         self.every = every
         self.drop_prob = drop_prob
         self.delay_prob = delay_prob
-        self.kinds: Mapping[str, Fields] = {}
+        self.kinds: Sequence[str] = ()
 
     def settings_of(self, member: int) -> ReadOnlyValues:
         """Return none; see `ctgraph_rl.learn.collective.ExchangeLike`, as for all methods."""

@@ -14,7 +14,7 @@ from baselines.methods.mask_lc import MaskLC
 from baselines.methods.parts.masks import Masks
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.learn.collective import Help
-from ctgraph_rl.learn.messages import TASK_ID, Array, Fields, Message, Number, to_all
+from ctgraph_rl.learn.messages import Message, to_all
 
 SHARE = 0.9
 """A peer's mask is wanted if this share of its return is more than one's own."""
@@ -38,9 +38,7 @@ class L2D2C(MaskExchange):
     @override
     def connect(self, agents: Sequence[Agent]) -> None:
         super().connect(agents)
-        about: Fields = {"task": TASK_ID, "reward": Number()}
-        mask: Fields = {**about, "scores": Array((len(self.methods[0].weights),))}
-        self.kinds = {"query": about, "offer": about, "request": {"task": TASK_ID}, "mask": mask}
+        self.kinds = ("query", "offer", "request", "mask")
 
     @override
     def send(self, kind: str, member: int, received: Sequence[Message]) -> Sequence[Message]:

@@ -33,15 +33,10 @@ from ctgraph_rl.checks import (
     true_or_false,
 )
 from ctgraph_rl.learn.collective import Help
-from ctgraph_rl.learn.messages import TASK_ID, Array, Fields, Message, Number, to_all
+from ctgraph_rl.learn.messages import Message, to_all
 
 LARGEST_RETURN = 0.9999
 """Of a return that decides the own share: others keep a share that can be learned."""
-
-SIMILARITY = Number(-1.001, 1.001)  # rounding
-
-ABOUT: Fields = {"task": TASK_ID, "reward": Number()}
-"""Of which task a message is, and the sender's return in it."""
 
 
 class Mosaic(MaskExchange):
@@ -112,14 +107,7 @@ class Mosaic(MaskExchange):
         require((self.top_n <= room, f"top_n must be at most method.max_received={room}, got {self.top_n}"))
         self.num_actions = max(method.num_actions for method in self.methods)
         self.known: list[KnownMask] = [KnownMask() for _ in agents]
-        self.shape: tuple[int, ...] = ()
-        scores = Array((len(self.methods[0].weights),))
-        self.kinds = {
-            "query": {**ABOUT, "embedding": Array(())},  # its length is that of the first one that is made
-            "offer": {**ABOUT, "similarity": SIMILARITY},
-            "request": {"task": TASK_ID, "similarity": SIMILARITY},
-            "mask": {**ABOUT, "similarity": SIMILARITY, "scores": scores},
-        }
+        self.kinds = ("query", "offer", "request", "mask")
 
     def observe(self, member: int, batch: TensorDictBase, episode_return: float) -> None:
         """Keep the batch's last transitions and its mean return, and update the embedding."""
@@ -134,13 +122,6 @@ class Mosaic(MaskExchange):
         points = sampled_points(known.recent, self.num_samples, self.num_actions, self.generator)
         new = linear_wasserstein(points, reference_points(self.num_references, points.shape[1]))
         known.embedding = (new if known.embedding is None else known.embedding + new) / 2
-        self._expect(tuple(new.shape))
-
-    def _expect(self, shape: tuple[int, ...]) -> None:
-        """Refuse queries whose embedding has another shape."""
-        self.shape = shape
-        query = {**self.kinds["query"], "embedding": Array(shape)}
-        self.kinds = {**self.kinds, "query": query}
 
     def send(self, kind: str, member: int, received: Sequence[Message]) -> Sequence[Message]:
         """Send queries, none without an embedding, and answer what was received."""
@@ -210,13 +191,12 @@ class Mosaic(MaskExchange):
     @override
     def state_dict(self) -> NamedValues:
         known = [dict(vars(each)) for each in self.known]
-        return {**super().state_dict(), "known": known, "shape": self.shape, "random": self.generator.get_state()}
+        return {**super().state_dict(), "known": known, "random": self.generator.get_state()}
 
     @override
     def load_state_dict(self, state: ReadOnlyValues) -> None:
         super().load_state_dict(state)
         self.known = [KnownMask(**each) for each in state["known"]]
-        self._expect(tuple(state["shape"]))
         self.generator.set_state(state["random"])
 
 

@@ -27,14 +27,14 @@ COLUMNS = (*RUN, "every", "drop_prob", "delay_prob", *MEASURES, *WHAT, "bytes", 
 
 SHOWN = (
     *("curriculum", "agent", "method", "exchange", "num_members", "seed"),
-    *("learning_time", "share_learned", "final_return", "sent", "dropped", "delayed", "refused", "bytes", "helps"),
+    *("learning_time", "share_learned", "final_return", "sent", "dropped", "delayed", "bytes", "helps"),
 )
 """Columns of the page's table."""
 
 MEANING = (
     f"learning_time: mean over members and blocks of the frames until {MASTERED} of a batch are at the goal; a block "
     "without one counts with all its frames. share_learned: share of blocks with one. final_return: sum over members "
-    "of the mean return of the last five batches of a block. sent, dropped, delayed, refused: messages. bytes: of what "
+    "of the mean return of the last five batches of a block. sent, dropped, delayed: messages. bytes: of what "
     "was sent. helps: masks that were taken over."
 )
 

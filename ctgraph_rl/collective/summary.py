@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from ctgraph_rl.checks import ReadOnlyValues, require
 from ctgraph_rl.disk import write_whole
-from ctgraph_rl.learn.messages import DELAYED, DELIVERED, DROPPED, REFUSED, SENT
+from ctgraph_rl.learn.messages import DELAYED, DELIVERED, DROPPED, SENT
 from ctgraph_rl.log.escape import csv_text
 from ctgraph_rl.log.files import LOG, METRICS, member_folder
 from ctgraph_rl.log.run_log import RunLog, write_metrics
@@ -32,7 +32,7 @@ FILES = (COLLECTIVE, "members.csv", "messages.csv", "helps.csv", METRICS)
 LAST = 5
 """Batches at the end of a block whose mean return is its final one, as in the raw data of MOSAIC."""
 
-WHAT = (SENT, DELIVERED, DROPPED, DELAYED, REFUSED)
+WHAT = (SENT, DELIVERED, DROPPED, DELAYED)
 
 RUN = ("curriculum", "agent", "method", "exchange", "num_members", "seed")
 """First columns of all tables: which collective a row is of."""
@@ -154,7 +154,7 @@ def describe_collective(collective: Collective) -> str:
             f"{about['num_members']} members, {about['exchange']}, {about['curriculum']}: learned "
             f"{collective.share_learned:.0%} of {num} blocks, {collective.learning_time:,.0f} frames each on average",
             f"messages: {collective.total(SENT):,} sent, {collective.total(DROPPED):,} lost, "
-            f"{collective.total(DELAYED):,} late, {collective.total(REFUSED):,} refused, "
+            f"{collective.total(DELAYED):,} late, "
             f"{collective.total('bytes'):,} bytes; {len(collective.helps):,} masks taken over",
             f"results: {collective.path}",
         ]
@@ -202,7 +202,6 @@ def metrics(collective: Collective) -> dict[str, Metric]:
         "final_return": (collective.final_return, f"sum over members of the mean return of the last {LAST} batches"),
         "messages": (float(collective.total(SENT)), "messages that were sent"),
         "bytes": (float(collective.total("bytes")), "bytes of their content"),
-        "refused": (float(collective.total(REFUSED)), "messages that were refused"),
         "helps": (float(len(collective.helps)), "masks that were taken over"),
     }
     return {name: Metric(value, f"collective/{name}", formula, HERE) for name, (value, formula) in values.items()}

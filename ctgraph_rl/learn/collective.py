@@ -16,7 +16,7 @@ from ctgraph_rl.checks import NamedValues, ReadOnlyValues, at_least_one, require
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.learn.lifelong import OfferCheckpoint
 from ctgraph_rl.learn.loop import Alone, Lockstep, Progress, SavedState, run_loop, saved_state_fits
-from ctgraph_rl.learn.messages import DELAYED, DELIVERED, DROPPED, REFUSED, SENT, Fields, Mail, Message
+from ctgraph_rl.learn.messages import DELAYED, DELIVERED, DROPPED, SENT, Mail, Message
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.tasks.curriculum import Curriculum
 
@@ -42,8 +42,8 @@ class ExchangeLike(Protocol):
 
     drop_prob: float
     delay_prob: float
-    kinds: Mapping[str, Fields]
-    """The kinds of messages, in the order in which an exchange sends them, with their fields."""
+    kinds: Sequence[str]
+    """The kinds of messages in the order in which they are sent within an exchange."""
 
     def settings_of(self, member: int) -> ReadOnlyValues:
         """Return this member's special settings, such as ``{"agent.learning_rate": 0.01}``."""
@@ -119,7 +119,7 @@ def learn_collective(
         exchange: what messages they send, and when.
         seed: decides which messages are lost or late.
         log: of the collective: lines ``exchange`` for messages and ``help`` for what members took over. The members'
-            own logs also have the latter, and what they refused. Default: a new one in memory.
+            own logs also have the latter. Default: a new one in memory.
         progress: updated after each round with the frames of all members and their mean return.
         device: of environments and agents.
         saved: a state that ``checkpoint`` was given, to resume with the same bits. Members are built the same way, and
@@ -297,15 +297,21 @@ class _Collective:
         for kind in self.exchange.kinds:
             for number, messages in received.items():
                 for message in self.exchange.send(kind, number, messages):
-                    self._post(message)
-            received = {number: self._take(number, kind) for number in received}
+                    others = set(range(len(self.members))) - {message.sender}
+                    wrong = f"goes from learner {message.sender} to {message.receiver}, which is no other member"
+                    require(
+                        (message.receiver in others, f"a {message.kind} {wrong}"),
+                        (message.kind == kind, f"a {message.kind} is sent in place of a {kind}"),
+                    )
+                    self.mail.post(message)
+            received = {number: self.mail.take(number, kind) for number in received}
         for number, messages in received.items():
             if self.learners[number].is_done:
                 continue
             for given in self.exchange.receive(number, messages):
                 self._log_help(given)
         for kind in sorted({of for of, _ in self.mail.counts}):
-            counts = {what: self.mail.counts[kind, what] for what in (SENT, DELIVERED, DROPPED, DELAYED, REFUSED)}
+            counts = {what: self.mail.counts[kind, what] for what in (SENT, DELIVERED, DROPPED, DELAYED)}
             self.log.append(
                 "exchange",
                 round=self.rounds,
@@ -314,18 +320,6 @@ class _Collective:
                 **counts,
                 bytes=self.mail.bytes[kind],
             )
-
-    def _post(self, message: Message) -> None:
-        others = set(range(len(self.members))) - {message.sender}
-        wrong = f"a {message.kind} goes from learner {message.sender} to {message.receiver}, which is no other member"
-        require((message.receiver in others, wrong))
-        self.mail.post(message)
-
-    def _take(self, number: int, kind: str) -> list[Message]:
-        good, refused = self.mail.take(number, kind, self.exchange.kinds)
-        for message, reason in refused:
-            self.members[number].log.append("refused", **self._place(number), sender=message.sender, reason=reason)
-        return good
 
     def _log_help(self, given: Help) -> None:
         values = {"sender": given.sender, **given.values}

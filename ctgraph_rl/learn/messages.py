@@ -1,26 +1,19 @@
-"""Messages between learners: their contents are checked, and a separate random stream loses or delays some.
-
-A message holds tensors and numbers by name. A receiver refuses and counts one whose kind, names, shapes or values its
-exchange does not state.
-"""
+"""Messages between learners: tensors and numbers by name. Some are lost or late, by a separate random stream."""
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import LARGEST_INT, NamedValues, ReadOnlyValues, fraction, is_int, is_real, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, fraction, require
 
 BYTES_OF_A_NUMBER = 8
 
-SENT, DROPPED, DELAYED, DELIVERED, REFUSED = "sent", "dropped", "delayed", "delivered", "refused"
-"""What is counted by kind of message; a delayed one is later also delivered or refused."""
+SENT, DROPPED, DELAYED, DELIVERED = "sent", "dropped", "delayed", "delivered"
+"""What is counted of the messages of a kind; a delayed one is also delivered, later."""
 
 
 @dataclass(frozen=True)
@@ -46,61 +39,6 @@ class Message:
             value.numel() * value.element_size() if isinstance(value, Tensor) else BYTES_OF_A_NUMBER
             for value in self.content.values()
         )
-
-
-class Number(NamedTuple):
-    """A finite number in [low, high]."""
-
-    low: float = -math.inf
-    high: float = math.inf
-    whole: bool = False
-
-    def why_not(self, value: Any) -> str | None:
-        """Return what is wrong with a value, if anything."""
-        is_number = is_int if self.whole else is_real
-        if not is_number(value):
-            return f"no finite {'integer' if self.whole else 'number'}"
-        return None if self.low <= value <= self.high else f"not in [{self.low}, {self.high}]"
-
-
-class Array(NamedTuple):
-    """A tensor of this shape and type whose elements are finite."""
-
-    shape: tuple[int, ...]
-    dtype: torch.dtype = torch.float32
-
-    def why_not(self, value: Any) -> str | None:
-        """Return what is wrong with a value, if anything."""
-        if not isinstance(value, Tensor):
-            return "no tensor"
-        if tuple(value.shape) != self.shape or value.dtype != self.dtype:
-            return f"{value.dtype} {list(value.shape)} instead of {self.dtype} {list(self.shape)}"
-        return None if bool(value.isfinite().all()) else "not finite"
-
-
-Fields = Mapping[str, Number | Array]
-"""What the content of a kind of message must be, by name."""
-
-TASK_ID = Number(0, LARGEST_INT, whole=True)
-
-
-def why_refused(message: Message, kinds: Mapping[str, Fields]) -> str | None:
-    """Return why a message must not be used; None if it may.
-
-    Args:
-        message: what was received.
-        kinds: the fields of each kind that the receiver knows.
-    """
-    fields = kinds.get(message.kind)
-    if fields is None:
-        return f"unknown kind {message.kind!r:.40}"
-    if message.content.keys() != fields.keys():
-        return f"a {message.kind} with other fields than {', '.join(fields)}"
-    for name, field in fields.items():
-        why = field.why_not(message.content[name])
-        if why is not None:
-            return f"{name} of a {message.kind}: {why}"
-    return None
 
 
 class Mail:
@@ -150,44 +88,29 @@ class Mail:
         else:
             self.here.append(message)
 
-    def take(
-        self, receiver: int, kind: str, kinds: Mapping[str, Fields]
-    ) -> tuple[list[Message], list[tuple[Message, str]]]:
-        """Return the messages that a receiver may use, and those that it refuses, with the reason.
-
-        Args:
-            receiver: number of a learner.
-            kind: messages of this kind, and of unknown kinds.
-            kinds: the fields of each known kind.
-        """
-        good = []
-        refused = []
+    def take(self, receiver: int, kind: str) -> list[Message]:
+        """Return what a receiver has got of a kind."""
+        taken = []
         others = []
         for each in self.here:
-            if each.receiver != receiver or (each.kind != kind and each.kind in kinds):
-                others.append(each)
-                continue
-            reason = why_refused(each, kinds)
-            self.counts[each.kind, DELIVERED if reason is None else REFUSED] += 1
-            if reason is None:
-                good.append(each)
+            if (each.receiver, each.kind) == (receiver, kind):
+                taken.append(each)
             else:
-                refused.append((each, reason))
+                others.append(each)
         self.here = others
-        return good, refused
+        if taken:
+            self.counts[kind, DELIVERED] += len(taken)
+        return taken
 
     def state_dict(self) -> NamedValues:
-        """Return the random stream and the late messages."""
-        return {"random": self.generator.get_state(), "late": list(map(_as_plain, self.late))}
+        """Return the random stream and the late messages, as tensors and plain values."""
+        late = [{**vars(message), "content": dict(message.content)} for message in self.late]
+        return {"random": self.generator.get_state(), "late": late}
 
     def load_state_dict(self, state: ReadOnlyValues) -> None:
         """Restore what `state_dict` returned."""
         self.generator.set_state(state["random"])
         self.late = [Message(**message) for message in state["late"]]
-
-
-def _as_plain(message: Message) -> NamedValues:
-    return {**vars(message), "content": dict(message.content)}
 
 
 def to_all(kind: str, sender: int, num_members: int, content: ReadOnlyValues) -> list[Message]:

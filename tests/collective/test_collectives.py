@@ -122,7 +122,7 @@ POPULATION = """
 import torch
 from baselines.exchanges.exchange import Exchange
 from ctgraph_rl.learn.collective import Help
-from ctgraph_rl.learn.messages import Array, Number, to_all
+from ctgraph_rl.learn.messages import to_all
 
 
 class Population(Exchange):
@@ -135,8 +135,7 @@ class Population(Exchange):
 
     def connect(self, agents):
         self.policies = [agent.policy for agent in agents]
-        size = torch.nn.utils.parameters_to_vector(self.policies[0].parameters()).numel()
-        self.kinds = {"weights": {"reward": Number(), "weights": Array((size,))}}
+        self.kinds = ["weights"]
 
     def observe(self, member, batch, episode_return):
         self.returns[member] = episode_return
@@ -239,7 +238,7 @@ def made(folder: Path, exchange: str, returns, helps=(), **measured: float) -> N
         log.close()
     log = RunLog(folder / "collective.jsonl")
     log.append("collective", config={**config, "seed": 3}, members=members)
-    counts = {"sent": 6, "delivered": 3, "dropped": 1, "delayed": 2, "refused": 0, "bytes": 96}
+    counts = {"sent": 6, "delivered": 3, "dropped": 1, "delayed": 2, "bytes": 96}
     log.append("exchange", round=0, frames=200, message="query", **counts)
     for sender, receiver in helps:
         log.append("help", round=0, block=1, frames=100, receiver=receiver, sender=sender, task_id=5)

@@ -15,7 +15,7 @@ from baselines.exchanges.isolated import Isolated
 from baselines.exchanges.l2d2c import L2D2C
 from ctgraph_rl import Block, RunLog, evaluate, learn_curriculum
 from ctgraph_rl.learn.collective import Help, Member, learn_collective
-from ctgraph_rl.learn.messages import TASK_ID, Array, Mail, Message, Number, to_all, why_refused
+from ctgraph_rl.learn.messages import Mail, Message, to_all
 from ctgraph_rl.runs.config import target
 from ctgraph_rl.runs.train import new_agent, with_method
 
@@ -58,7 +58,7 @@ class Gossip(Exchange):
     """Every member sends random tensors of its own, which change nobody, and takes note of those that arrive."""
 
     def connect(self, agents) -> None:
-        self.kinds = {"word": {"task": TASK_ID, "noise": Array((3,))}}
+        self.kinds = ["word"]
         self.random = torch.Generator().manual_seed(1)
 
     def send(self, kind, member, received):
@@ -225,52 +225,31 @@ def test_members_with_one_backbone_begin_each_task_with_equal_scores_and_others_
     assert not torch.equal(alike[0].random, alike[1].random)
 
 
-KINDS = {"mask": {"task": TASK_ID, "reward": Number(0, 1), "scores": Array((3,))}}
 GOOD = {"task": 2, "reward": 0.5, "scores": torch.ones(3)}
 
 
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        ({}, None),
-        ({"scores": torch.ones(4)}, "scores of a mask: torch.float32 [4] instead of torch.float32 [3]"),
-        ({"scores": torch.ones(3).double()}, "scores of a mask: torch.float64 [3] instead of torch.float32 [3]"),
-        ({"scores": torch.tensor([1.0, torch.inf, 0])}, "scores of a mask: not finite"),
-        ({"scores": [1.0, 1.0, 1.0]}, "scores of a mask: no tensor"),
-        ({"reward": float("nan")}, "reward of a mask: no finite number"),
-        ({"reward": 2.0}, "reward of a mask: not in [0, 1]"),
-        ({"task": True}, "task of a mask: no finite integer"),
-        ({"more": 1}, "a mask with other fields than task, reward, scores"),
-    ],
-)
-def test_a_message_holds_what_its_kind_must_hold_or_is_refused(change, reason):
-    assert why_refused(Message("mask", 0, 1, {**GOOD, **change}), KINDS) == reason
-    assert why_refused(Message("virus", 0, 1, {**GOOD, **change}), KINDS) == "unknown kind 'virus'"
-
-
-class Liar(Gossip):
-    """The last member's messages are not what they must be, and one is of an unknown kind."""
+class Wrong(Gossip):
+    """Messages that no member can take."""
 
     def send(self, kind, member, received):
-        noise = torch.full((3,), torch.nan) if member == 2 else torch.zeros(3)
-        sent = to_all(kind, member, self.num_members, {"task": member, "noise": noise})
-        return [*sent, Message("virus", member, 0, {})] if member == 1 else sent
+        return [Message(self.sent_kind, member, self.receiver, {})]
 
 
-def test_refused_messages_change_nothing_and_are_counted_in_both_logs(make):
-    members = make()
+@pytest.mark.parametrize(
+    ("kind", "receiver", "message"),
+    [
+        ("word", 0, "a word goes from learner 0 to 0, which is no other member"),
+        ("word", 3, "a word goes from learner 0 to 3, which is no other member"),
+        ("virus", 1, "a virus is sent in place of a word"),
+    ],
+)
+def test_a_message_to_nobody_or_of_another_kind_is_an_error(make, kind, receiver, message):
+    exchange = Wrong(3, every=100, drop_prob=0.0, delay_prob=0.0)
+    exchange.sent_kind = kind
+    exchange.receiver = receiver
 
-    log = learn_collective(members, Liar(3, every=100, drop_prob=0.0, delay_prob=0.0))
-
-    counts = {line["message"]: (line["sent"], line["delivered"], line["refused"]) for line in log.of_kind("exchange")}
-    assert counts == {"word": (6, 4, 2), "virus": (1, 0, 1)}
-    assert [(line["receiver"], line["sender"]) for line in log.of_kind("help")] == [(0, 1), (1, 0), (2, 0), (2, 1)]
-    assert [[line["reason"] for line in each.log.of_kind("refused")] for each in members] == [
-        ["unknown kind 'virus'", "noise of a word: not finite"],
-        ["noise of a word: not finite"],
-        [],
-    ]
-    assert [line["bytes"] for line in log.of_kind("exchange")] == [0, 6 * (8 + 12)]
+    with pytest.raises(ValueError, match=message):
+        learn_collective(make(), exchange)
 
 
 def test_messages_are_lost_and_late_as_often_as_stated_and_the_late_ones_come_next_time():
@@ -281,14 +260,14 @@ def test_messages_are_lost_and_late_as_often_as_stated_and_the_late_ones_come_ne
         mail.post(each)
         same.post(each)
         other.post(each)
-    now, _ = mail.take(1, "mask", KINDS)
+    now = mail.take(1, "mask")
     mail.begin()
-    then, _ = mail.take(1, "mask", KINDS)
+    then = mail.take(1, "mask")
 
     assert 1000 - len(now) - len(then) == pytest.approx(300, abs=60)  # four standard deviations
     assert len(then) == pytest.approx(350, abs=60)
     assert not {each.content["task"] for each in now} & {each.content["task"] for each in then}
-    assert [now, then] == [same.take(1, "mask", KINDS)[0], same.late]
+    assert [now, then] == [same.take(1, "mask"), same.late]
     assert torch.equal(mail.generator.get_state(), other.generator.get_state())
 
 
