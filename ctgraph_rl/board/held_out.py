@@ -1,7 +1,7 @@
-"""Level *held out* of a verification: the submitted configuration learns what no one could tune it for.
+"""Level *held out* of a verification: the submitted configuration learns what it could not be tuned for.
 
-Seeds, images and goals follow from the submission and the verifier's number. The scores are tested against the
-submitted ones: are they lower than chance explains?
+Seeds, images and goals follow from the submission and the verifier's number. A test asks whether the scores are lower
+than the submitted ones.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ HELD_OUT = LEVELS[2]
 
 
 def seeds_of(submission: Submission, number: int, count: int) -> tuple[int, ...]:
-    """Return the seeds that a verifier's number draws: by the rule of the track, or from `HELD_OUT_SEEDS`."""
+    """Return the seeds that a verifier's number draws, by the track's rule or from `HELD_OUT_SEEDS`."""
     if submission.track is not None:
         return submission.track.draw_held_out_seeds(submission.digest, number, count)
     return held_out_seeds(f"{submission.digest} {number}", count)
 
 
 def held_out_cells(submission: Submission, number: int, count: int, folder: Path) -> list[RerunCell]:
-    """Return what is learned: a seed each, with other images and goals, and the submitted configuration.
+    """Return what is learned: one seed each, with other images and goals, and the submitted configuration.
 
-    Each has a folder within ``folder``, with the file of its curriculum.
+    Each has a folder within ``folder`` with its curriculum's file.
     """
     cells = []
     first = submission.finished[0]
@@ -53,7 +53,7 @@ def held_out_cells(submission: Submission, number: int, count: int, folder: Path
 
 
 def held_out_checks(submission: Submission, results: Sequence[tuple[RerunCell, Rerun]]) -> Iterator[Check]:
-    """Yield a check for each run that failed, those of the protocol of the others, and that of their scores."""
+    """Yield a check of each failed run, of the other runs' protocol, and of their scores."""
     name = score_name(submission)
     found = []
     for cell, result in results:
@@ -81,12 +81,11 @@ def _of_the_protocol(submission: Submission, curriculum: Curriculum, seed: int, 
 
 
 def other_curriculum(curriculum: Curriculum, key: str) -> Curriculum:
-    """Return a curriculum with other images and goals, and all else alike: what its tasks share, they share still.
+    """Return a curriculum with other images and goals; what its tasks shared, they still share.
 
-    Tasks that are no CT-graphs stay, and only the seeds change.
-
-    Every generated image set gets another seed, equal ones the same. The branches of every decision state are renamed,
-    in all tasks alike, so that goals that share their first decisions do so afterwards. Image sets without a seed stay.
+    Every generated image set gets another seed, equal ones the same; image sets without a seed stay. The branches of
+    every decision state are renamed, in all tasks alike, so goals still share their first decisions. Tasks that are no
+    CT-graphs stay; only the seeds change.
 
     Args:
         curriculum: what was learned.
@@ -106,7 +105,7 @@ def other_curriculum(curriculum: Curriculum, key: str) -> Curriculum:
 
 
 def other_task(task: Task, key: str) -> Task:
-    """Return a task with other images and another goal; see `other_curriculum`."""
+    """Return a task with other images and another goal, as in `other_curriculum`."""
     changed: dict[str, Any] = {"goal": renamed(task.goal, task.graph.branching_factor, key)}
     if task.image_seed is not None:
         seed = HELD_OUT_SEEDS[drawn(f"{key} images {task.image_seed}", len(HELD_OUT_SEEDS))]
@@ -120,10 +119,10 @@ def other_task(task: Task, key: str) -> Task:
 
 
 def renamed(path: tuple[int, ...], branching_factor: int, key: str) -> tuple[int, ...]:
-    """Return a path through a tree whose branches are renamed at every node, decisions in 1..b.
+    """Return a path through a tree whose branches are renamed at every node.
 
     Args:
-        path: decisions from the home state on.
+        path: decisions from the home state, in 1..b.
         branching_factor: b.
         key: decides the new names.
     """

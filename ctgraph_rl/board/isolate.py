@@ -1,11 +1,11 @@
 """The code of others in bubblewrap, within limits of time, memory, disk and processes.
 
-https://github.com/containers/bubblewrap, 0.8 or newer. Inside are Python and the programs of the system, read-only, and
-one folder to write to. There is no network, no other process, no capability, no terminal and nothing that was open.
-libseccomp makes a filter of system calls for what name spaces leave open. Without these nothing runs.
+https://github.com/containers/bubblewrap, 0.8 or newer. Inside are Python and the system's programs, read-only, and one
+folder to write to; no network, other process, capability, terminal or open file. libseccomp filters the system calls
+that name spaces leave open. Without these nothing runs.
 
-Memory is limited for all processes together: by a cgroup, made here or by systemd, else by a number of threads that
-have a share of the memory each. Where no way holds, nothing runs either.
+A cgroup limits the memory of all processes together, made here or by systemd; else a number of threads with a share of
+the memory each. Where neither works, nothing runs.
 """
 
 from __future__ import annotations
@@ -31,28 +31,28 @@ from ctgraph_rl.checks import positive, require
 from ctgraph_rl.disk import make_folder
 
 OLDEST = (0, 8)
-"""The first version of bubblewrap that has all options."""
+"""The first version of bubblewrap with all options."""
 
 OPTIONS = (
     *("--unshare-all", "--unshare-user", "--disable-userns", "--cap-drop", "ALL"),
     *("--new-session", "--die-with-parent"),
 )
-"""New name spaces but no further ones, no capability, no terminal; the process ends when its watcher ends."""
+"""New name spaces but no further ones, no capability, no terminal; the process ends with its watcher."""
 
 SYSTEM = ("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32", "/etc/alternatives", "/etc/ld.so.cache")
 """Programs and libraries."""
 
 PACKAGES = ("ctgraph_rl", "baselines", "conf", "curricula", "hydra_plugins")
-"""Folders of our packages, beside each other."""
+"""Folders of our packages, side by side."""
 
 GRAPHICS = ("nvidia*", "kfd", "dri")
 """Devices of graphics cards, in ``/dev``."""
 
 OWN = {"/tmp": "tmp", "/dev/shm": "shm"}
-"""Folders to write to, and where they are in the folder of the process: what is written there is counted with it."""
+"""Folders to write to, and their places in the folder of the process, with which they are counted."""
 
 KEPT = ("PATH", "LANG", "LC_ALL", "TZ", "CC", "LD_LIBRARY_PATH", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")
-"""Variables of the environment that a process is given; no other is."""
+"""Variables of the environment that a process gets."""
 
 REFUSED = {
     errno.EPERM: (
@@ -63,22 +63,22 @@ REFUSED = {
 }
 """System calls by the error that they give: keyrings, debugging, the kernel's programs, memory outside of limits.
 
-Libraries take others where one is missing (ENOSYS).
+Libraries use others where one is missing (ENOSYS).
 """
 
 ALLOW, REFUSE = 0x7FFF0000, 0x00050000
-"""Actions, from linux/seccomp.h."""
+"""Actions of linux/seccomp.h."""
 
 CGROUPS = Path("/sys/fs/cgroup")
 
 MOST_FILES, MOST_OPEN, MOST_THREADS = 100_000, 4096, 1024
-"""Files in the folder, open files of a process, and threads of all processes together."""
+"""Files in the folder, open files of a process, and threads of all processes."""
 
 LEAST_FREE = 10**9
 """Bytes that stay free on the disk."""
 
 MOST_OUTPUT = 2**12
-"""Bytes of what a process printed that are shown: the last ones."""
+"""Last bytes of a process's output that are shown."""
 
 SECONDS_BETWEEN_LOOKS = 0.5
 """At the folder of a process."""
@@ -90,7 +90,7 @@ CGROUP, SYSTEMD, THREADS = "a cgroup", "systemd", "threads"
 
 
 class Limits(NamedTuple):
-    """What a process and all that it starts may use."""
+    """What a process and its children may use."""
 
     seconds: float  # of wall-clock time
     memory: int  # bytes
@@ -99,12 +99,12 @@ class Limits(NamedTuple):
 
     @property
     def most_threads(self) -> int:
-        """Threads of all processes where each has a share of the memory: Python starts a few beside those of torch."""
+        """Threads of all processes that share the memory: Python starts a few beside those of torch."""
         return 4 + 2 * self.threads
 
 
 class Isolation(NamedTuple):
-    """How the code of others is closed off here."""
+    """How the code of others is isolated here."""
 
     bubblewrap: str | None  # its version; None: it cannot be used
     why_not: str | None  # why it cannot, and what to install
@@ -112,14 +112,14 @@ class Isolation(NamedTuple):
     graphics: bool  # whether the code may use the graphics cards
 
     def closed(self) -> list[str]:
-        """Return what is closed off, a text for each thing."""
+        """Return what is isolated, a text for each thing."""
         inside = "it sees no files but its folder, the code, Python and the programs of the system"
         other = "no other process, socket, shared memory, keyring, device or terminal"
         memory = f"memory limited for all its processes together, by {self.memory}"
         return [f"bubblewrap {self.bubblewrap}", "no network", inside, "it changes only its folder", other, memory]
 
     def missing(self) -> list[str]:
-        """Return a text for each thing that is not closed off or not limited."""
+        """Return what is not isolated or not limited, a text for each thing."""
         cards = "graphics cards: it may use all of their memory and of their driver"
         kernel = "the kernel's own memory for it is not limited, such as buffers of pipes and sockets"
         return [
@@ -141,7 +141,7 @@ class Outcome(NamedTuple):
 
     @property
     def failure(self) -> str | None:
-        """Why it did not end well, in words; None if it did."""
+        """Why it failed, in words; None if it did not."""
         if self.stopped is not None:
             return f"stopped: {self.stopped}"
         last = self.output.strip().splitlines()[-1:] or ["it printed nothing"]
@@ -149,7 +149,7 @@ class Outcome(NamedTuple):
 
 
 def isolation(folder: Path, limits: Limits, graphics: bool = False) -> Isolation:
-    """Return what this system closes off: a process inside, in each way to limit memory, has to answer.
+    """Return what this system isolates, by a test process for each way to limit memory.
 
     Args:
         folder: an existing directory for that process.
@@ -187,7 +187,7 @@ def isolation(folder: Path, limits: Limits, graphics: bool = False) -> Isolation
 
 
 def bubblewrap_version() -> tuple[int, ...] | None:
-    """Return the version of bubblewrap; None where there is none."""
+    """Return the version of bubblewrap, if it is installed."""
     path = shutil.which("bwrap")
     if path is None:
         return None
@@ -205,18 +205,18 @@ def run_isolated(
     paths: Sequence[Path] = (),
     variables: Mapping[str, str] | None = None,
 ) -> Outcome:
-    """Run a command in bubblewrap, within limits, and leave none of its processes behind.
+    """Run a command in bubblewrap, within limits, and leave no process behind.
 
     Args:
-        command: with an absolute path of its program.
-        folder: an existing directory, the only one that it may change; its working directory and its home.
+        command: starts with an absolute path.
+        folder: an existing directory, the only one that it may change; its working directory and home.
         limits: what it may use.
-        isolated: how it is closed off; what is open was agreed to.
+        isolated: how it is isolated; the user agreed to what is not.
         paths: folders that it may read beside the system's and Python's.
         variables: of its environment, beside `KEPT`.
 
     Raises:
-        ValueError: for a limit that is not positive, and where `isolation` found none.
+        ValueError: for a limit that is not positive, and where `isolation` found no way.
         OSError: if no cgroup can be made.
     """
     require(
@@ -258,7 +258,7 @@ def run_isolated(
 
 
 def _wait(process: subprocess.Popen[bytes], folder: Path, limits: Limits) -> str | None:
-    """Wait for a process; return the limit that it broke, None if it ended by itself within all of them."""
+    """Wait for a process; return the limit that it broke, if any."""
     end = time.monotonic() + limits.seconds
     while True:
         try:
@@ -272,7 +272,7 @@ def _wait(process: subprocess.Popen[bytes], folder: Path, limits: Limits) -> str
 
 
 def _why_too_much(folder: Path, disk: int) -> str | None:
-    """Return why a folder holds more than it may; None if it does not."""
+    """Return why a folder holds more than it may, if it does."""
     closed = ["-type", "d", "(", "!", "-readable", "-o", "!", "-executable", ")", "-printf", "closed\n"]
     command = ["find", str(folder), "-xdev", *closed, "-o", "-printf", "%b\n"]
     blocks = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True).stdout.split()
@@ -297,7 +297,7 @@ def strip_privileges(folder: Path) -> None:
 
 
 def _limit_each(limits: Limits, shares_memory: bool) -> list[str]:
-    """Return the beginning of a command that limits each process, from the inside."""
+    """Return the start of a command that limits each process, from the inside."""
     import resource  # here: only POSIX systems have it
 
     seconds = math.ceil(limits.seconds) * (os.cpu_count() or 1)
@@ -313,7 +313,7 @@ def _limit_each(limits: Limits, shares_memory: bool) -> list[str]:
 
 
 def _limit_together(limits: Limits, way: str | None, groups: Sequence[Path]) -> list[str]:
-    """Return the beginning of a command that limits the memory of all processes, from the outside."""
+    """Return the start of a command that limits the memory of all processes, from the outside."""
     if way == SYSTEMD:
         user = [] if os.geteuid() == 0 else ["--user"]
         values = (f"MemoryMax={limits.memory}", "MemorySwapMax=0", f"TasksMax={MOST_THREADS}")
@@ -325,7 +325,7 @@ def _limit_together(limits: Limits, way: str | None, groups: Sequence[Path]) -> 
 
 
 def new_cgroups(memory: int) -> list[Path]:
-    """Make the cgroups of a process with limits, within those of this process; there are two in version 1.
+    """Make cgroups with limits within those of this process; two in version 1.
 
     Raises:
         OSError: where none can be made, or one lacks a limit.
@@ -359,7 +359,7 @@ def new_cgroups(memory: int) -> list[Path]:
 
 
 def _own_cgroups() -> dict[str, str]:
-    """Return the paths of the cgroups of this process by their controllers, that of version 2 by an empty text."""
+    """Return this process's cgroups by controller, that of version 2 by an empty text."""
     own = {}
     for line in Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines():
         _, controllers, path = line.split(":", 2)
@@ -368,13 +368,12 @@ def _own_cgroups() -> dict[str, str]:
 
 
 def _set(path: Path, value: object) -> None:
-    """Write a value into a file that is there."""
     with path.open("r+", encoding="ascii") as file:
         file.write(str(value))
 
 
 def _remove_cgroups(groups: Sequence[Path]) -> None:
-    """Remove cgroups, once the last of their killed processes is gone."""
+    """Remove cgroups once the last of their killed processes is gone."""
     end = time.monotonic() + SECONDS_TO_START
     for group in groups:
         while True:
@@ -396,7 +395,7 @@ def confined(
     filtering: int,
     graphics: bool = False,
 ) -> list[str]:
-    """Return the command that runs another one inside; see `run_isolated` for its arguments.
+    """Return the command that runs another one inside; arguments as `run_isolated`.
 
     ``filtering`` is the open file of `system_calls`.
 
@@ -428,7 +427,7 @@ def confined(
 
 
 def _needed(paths: Sequence[Path]) -> list[str]:
-    """Return what Python and our packages are read from, and given folders, those that hold others first."""
+    """Return the folders that Python and our packages need, and given ones, outer folders first."""
     sites = [path for path in sys.path if Path(path).name in ("site-packages", "dist-packages")]
     named: list[str | Path] = [*paths, sys.prefix, sys.base_prefix, *sites, *(home() / name for name in PACKAGES)]
     both = {*map(os.path.abspath, named), *map(os.path.realpath, named)}
@@ -441,7 +440,7 @@ def home() -> Path:
 
 
 def _libseccomp() -> ctypes.CDLL | None:
-    """Return https://github.com/seccomp/libseccomp; None where there is none."""
+    """Return https://github.com/seccomp/libseccomp, if installed."""
     try:
         return ctypes.CDLL("libseccomp.so.2")
     except OSError:
@@ -450,7 +449,7 @@ def _libseccomp() -> ctypes.CDLL | None:
 
 @contextmanager
 def system_calls() -> Iterator[int]:
-    """Open a file with the filter of system calls, as the library writes it for this machine."""
+    """Open a file with libseccomp's filter of system calls for this machine."""
     library = _libseccomp()
     assert library is not None
     library.seccomp_init.restype = ctypes.c_void_p

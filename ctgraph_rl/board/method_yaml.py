@@ -1,4 +1,4 @@
-"""``method.yaml``: what the author of a method says about it, and what its runs say themselves."""
+"""``method.yaml``: what the author of a method says about it, against what its runs say."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ compute:
   tuning_hours: null        # of the runs by which settings were chosen
 failed: {}                  # seeds of runs without results, each with the reason, such as {3: out of memory}
 """
-"""A ``method.yaml`` to fill in, with a comment on every line."""
+"""A ``method.yaml`` to fill in, with comments."""
 
 EXAMPLE: ReadOnlyValues = yaml.safe_load(TEMPLATE)
 
@@ -52,7 +52,7 @@ HOURS_APART, SHARE_APART = 0.01, 0.05
 """How far the hours of a ``method.yaml`` may be from those of the logs."""
 
 OURS = "ctgraph_rl"
-"""Stands for the repository of this package."""
+"""Stands for this package's repository."""
 
 
 class Kind(NamedTuple):
@@ -63,12 +63,12 @@ class Kind(NamedTuple):
 
 
 def or_null(kind: Kind) -> Kind:
-    """Return a kind that may be missing."""
+    """Return a kind that may be None."""
     return Kind(lambda value: value is None or kind.holds(value), f"{kind.what} or null")
 
 
 def matching(pattern: str, what: str) -> Kind:
-    """Return the kind of texts that match a regular expression as a whole."""
+    """Return the kind of texts that match a whole regular expression."""
     return Kind(lambda value: isinstance(value, str) and re.fullmatch(pattern, value) is not None, what)
 
 
@@ -78,7 +78,7 @@ def list_of(kind: Kind, what: str) -> Kind:
 
 
 def kind_rules(values: ReadOnlyValues, kinds: Mapping[str, Kind], owner: str = "") -> list[Rule]:
-    """Return the rule for each field that is there; the owner stands behind its name."""
+    """Return the rule of each present field, whose name follows the owner."""
     rules = []
     for name, value in values.items():
         kind = kinds[name]
@@ -119,7 +119,7 @@ KINDS = {
     "compute.tuning_hours": HOURS,
     "failed": Kind(_are_reasons, "a reason for each seed, such as {3: out of memory}"),
 }
-"""Fields with dotted names; all must be there but ``track_version``, which ``submit`` writes."""
+"""Fields by dotted names; only ``track_version`` may be missing, which ``submit`` writes."""
 
 PARTS = ("code", "given", "tuning", "compute")
 """Fields that hold others."""
@@ -129,7 +129,7 @@ def read_method(path: Path) -> NamedValues:
     """Read a ``method.yaml``.
 
     Raises:
-        ValueError: for what is no YAML, a missing or unknown key, and values out of range; names all of them.
+        ValueError: for what is no YAML, missing or unknown keys, and values out of range; names all.
         OSError: if it cannot be read.
     """
     with named(path):
@@ -150,7 +150,7 @@ def check_method(method: Any) -> None:
     """Refuse what does not describe a method.
 
     Raises:
-        ValueError: for a missing or unknown key, and values out of range; names all of them.
+        ValueError: for missing or unknown keys and values out of range; names all.
     """
     fix = "ctgraph-rl submit --template prints one to fill in"
     require((isinstance(method, Mapping), f"it must hold name, authors and so on, got {method!r:.80}; {fix}"))
@@ -174,11 +174,11 @@ def check_method(method: Any) -> None:
 
 
 def completed(method: ReadOnlyValues, facts: Mapping[str, ReadOnlyValues]) -> NamedValues:
-    """Return a method with what is null in it as the runs say it.
+    """Return a method with its nulls filled in from the runs.
 
     Args:
-        method: what a ``method.yaml`` holds.
-        facts: what the runs say, as `facts_of` returns it.
+        method: content of a ``method.yaml``.
+        facts: from `facts_of`.
     """
     filled = dict(method)
     for part, known in facts.items():
@@ -201,11 +201,11 @@ def facts_of(protocol: Protocol, runs: Sequence[Any]) -> dict[str, NamedValues]:
 def fact_rules(
     method: ReadOnlyValues, facts: Mapping[str, ReadOnlyValues], runs: Sequence[Any], num_tasks: int
 ) -> list[Rule]:
-    """Return the rules that a method does not contradict its runs; what is null in it contradicts nothing.
+    """Return the rules that a method does not contradict its runs; nulls contradict nothing.
 
     Args:
-        method: what a ``method.yaml`` holds.
-        facts: what the runs say.
+        method: content of a ``method.yaml``.
+        facts: from `facts_of`.
         runs: the submitted runs.
         num_tasks: of the curriculum.
     """

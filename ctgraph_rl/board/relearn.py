@@ -1,7 +1,7 @@
-"""What runs in a separate process: runs are learned again, from a configuration or by the code of others.
+"""The separate process that learns runs again, from a configuration or by the code of others.
 
 ``python -m ctgraph_rl.board.relearn JOB.json [CODE ...]`` writes a run directory for each seed into the working
-directory; modules of others are looked for in the folders CODE, after all that are installed.
+directory. Modules of others are looked for in the folders CODE, after all that are installed.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ def learn_again(job: Relearning, folder: Path) -> None:
     """Learn every seed of a job into a run directory within a folder.
 
     Raises:
-        ValueError: for a configuration or an entry point that cannot be run here.
-        RuntimeError: if seeds that are trained together have failed.
+        ValueError: for a configuration or an entry point that cannot run here.
+        RuntimeError: if stacked seeds failed.
     """
     run_dirs = [run_dir_of(folder, seed) for seed in job.seeds]
     if job.entry_point is not None:
@@ -74,21 +74,21 @@ def learn_again(job: Relearning, folder: Path) -> None:
 
 
 def configuration(stored: ReadOnlyValues) -> DictConfig:
-    """Return the configuration whose settings a run stored, with the default of all that changes no result."""
+    """Return a run's stored settings as a configuration, with defaults for all that changes no result."""
     settings = dict(config.composed([]))
     settings |= {key: with_added(value) if isinstance(value, Mapping) else value for key, value in stored.items()}
     return DictConfig(settings)
 
 
 def _settings(job: Relearning, seed: int) -> NamedValues:
-    """Return the settings of a seed, with the curriculum of the job's file if it has one."""
+    """Return the settings of a seed, with the curriculum of the job's file, if any."""
     target = "ctgraph_rl.tasks.curriculum.Curriculum.from_json"
     own = {} if job.curriculum is None else {"curriculum": {"_target_": target, "path_or_dict": job.curriculum}}
     return {**job.config, "seed": seed, **own}
 
 
 def _call(job: Relearning, run_dir: Path) -> None:
-    """Call the entry point of a learner that is not ours."""
+    """Call the entry point of a learner of others."""
     module, _, name = str(job.entry_point).partition(":")
     function = getattr(import_module(module), name, None)
     require(

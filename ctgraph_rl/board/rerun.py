@@ -1,8 +1,7 @@
-"""Level *rerun* of a verification: drawn runs are trained again, in separate processes, and compared bit by bit.
+"""Level *rerun* of a verification: drawn runs are trained again in separate processes and compared bit by bit.
 
-No one knows which runs are drawn before both the submission and the verifier's number are fixed: they are those with
-the smallest SHA-256 of ``DIGEST NUMBER RUN``. Runs that were trained together are trained again as their group,
-and so are single-task experts.
+The drawn runs are those with the smallest SHA-256 of ``DIGEST NUMBER RUN``, so that neither side can choose them. Runs
+that were trained together are trained again as their group, as are single-task experts.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ MODULE = "ctgraph_rl.board.relearn"
 JOB = "job.json"
 
 SCORE = "average_performance"
-"""The metric that is compared where a track does not name its own."""
+"""The metric that is compared unless a track names another."""
 
 BYTES = "bytes of the agent"
 """The check of what is equal also where bits differ."""
@@ -53,7 +52,7 @@ NOT_OF_THE_RUN = ("MemoryError", "ModuleNotFoundError")
 """Errors that limits and missing code cause here."""
 
 OWN_VERSION = ("ctgraph_rl", "python")
-"""Versions that may differ between equal bits; the numbers version says when those of this package do."""
+"""Versions that may differ between equal bits; the numbers version stands for this package's."""
 
 
 class RerunCell(NamedTuple):
@@ -82,7 +81,7 @@ class RerunCell(NamedTuple):
 
 
 class Rerun(NamedTuple):
-    """What a seed that was learned again has left."""
+    """What a seed that was learned again left."""
 
     log: RunLog | None
     agent_sha256: str | None
@@ -93,7 +92,7 @@ class Rerun(NamedTuple):
 
 
 def draw(submission: Submission, number: int, count: int) -> tuple[SubmittedRun, ...]:
-    """Return the runs that a verifier's number draws, all if there are fewer; failed runs are drawn as others are."""
+    """Return the runs that a verifier's number draws, failed ones too; all if there are fewer."""
 
     def place(run: SubmittedRun) -> bytes:
         return hashlib.sha256(f"{submission.digest} {number} {run.run}".encode()).digest()
@@ -114,7 +113,7 @@ def cells_of(submission: Submission, drawn: Sequence[SubmittedRun], folder: Path
 
 
 def _groups_of_experts(submission: Submission, runs: Sequence[SubmittedRun]) -> tuple[tuple[int, tuple[int, ...]], ...]:
-    """Return the tasks of the single-task experts of finished runs, from 1, each with the seeds that were one batch."""
+    """Return the tasks of single-task experts, from 1, each with the seeds that were one batch."""
     found: dict[tuple[int, tuple[int, ...]], None] = {}
     for run in runs:
         for each in experts_of(submission.log(run)) if run.finished else ():
@@ -133,7 +132,7 @@ def job_of(
     Args:
         submission: of which.
         seeds: one, or those of a group.
-        run: one of the submitted runs, whose number of threads counts.
+        run: a submitted run, whose number of threads counts.
         curriculum: file of another curriculum; None: the submitted one.
     """
     entry = submission.method["entry_point"]
@@ -146,7 +145,7 @@ def job_of(
 
 
 def learn_again(cell: RerunCell, limits: Limits, isolated: Isolation, code: Sequence[Path] = ()) -> Outcome:
-    """Learn a cell in a separate process; one that was stopped before is resumed where its learner can be.
+    """Learn a cell in a separate process; a stopped one resumes where its learner can.
 
     Modules of others are looked for in ``code``.
     """
@@ -180,7 +179,7 @@ def is_portable(config: ReadOnlyValues) -> bool:
 
 
 def result_of(cell: RerunCell, seed: int, outcome: Outcome) -> Rerun:
-    """Read what a seed has left; what cannot be read is a failure."""
+    """Read what a seed left; what cannot be read is a failure."""
     run_dir = run_dir_of(cell.folder, seed)
     try:
         for name in ("", LOG, AGENT, METRICS, FAILURE):
@@ -197,7 +196,7 @@ def result_of(cell: RerunCell, seed: int, outcome: Outcome) -> Rerun:
 
 
 def _experts(folder: Path, log: RunLog) -> tuple[RunLog, ...]:
-    """Return the logs of the single-task experts that a log names; they must be in the folder of its process."""
+    """Return the logs of a log's single-task experts, which must be in the folder of its process."""
     logs = []
     for each in experts_of(log):
         path = (folder / str(each.get("run")) / LOG).resolve()
@@ -208,7 +207,6 @@ def _experts(folder: Path, log: RunLog) -> tuple[RunLog, ...]:
 
 
 def _failed(run_dir: Path, outcome: Outcome) -> Rerun:
-    """Return that a seed has no results, and why."""
     with suppress(OSError, ValueError):
         reason = read_text(run_dir / FAILURE, MOST_BYTES_OF_A_REASON).strip()
         alone = outcome.stopped is None and not reason.startswith(NOT_OF_THE_RUN)
@@ -217,10 +215,7 @@ def _failed(run_dir: Path, outcome: Outcome) -> Rerun:
 
 
 def why_other_bits(submission: Submission, runs: Sequence[SubmittedRun]) -> list[str]:
-    """Return in words why runs may have other bits here than where they were submitted; none if bits are promised.
-
-    See ``docs/explanation/reproducibility.md``.
-    """
+    """Return why runs may have other bits here than where they were submitted; none if bits are promised."""
     about = submission.log(runs[0]).measurements[0]
     stored = about.get("numbers", 1)
     here = numbers_of(about)
@@ -247,8 +242,8 @@ def why_other_bits(submission: Submission, runs: Sequence[SubmittedRun]) -> list
 def checks_of(run: SubmittedRun, submitted: RunLog, result: Rerun, experts: Sequence[RunLog] = ()) -> list[Check]:
     """Compare a submitted run with what was learned again, bit by bit.
 
-    A run that cannot be finished here, and a failed one that does not fail by itself, decide nothing: the machine or a
-    limit may be why.
+    A run that cannot finish here, or failed without failing by itself, decides nothing: the machine or a limit may be
+    why.
     """
     if not run.finished:
         again = True if result.failed_alone else None
@@ -268,7 +263,7 @@ def checks_of(run: SubmittedRun, submitted: RunLog, result: Rerun, experts: Sequ
 
 
 def first_difference(submitted: RunLog, found: RunLog) -> str:
-    """Return in words the first measurement in which two logs differ; empty if there is none."""
+    """Return in words the first measurement in which two logs differ, if any."""
     lines = zip_longest(map(counted, submitted.measurements), map(counted, found.measurements), fillvalue=NO_ROW)
     for number, (one, other) in enumerate(lines, 1):
         keys = differing(one, other)
@@ -279,17 +274,17 @@ def first_difference(submitted: RunLog, found: RunLog) -> str:
 
 
 def score_name(submission: Submission) -> str:
-    """Return the name of the metric that is compared."""
+    """Return the metric that is compared."""
     return SCORE if submission.track is None else submission.track.score
 
 
 def score_of(log: RunLog, curriculum: Curriculum, name: str) -> float | None:
-    """Return a metric of a log, None where it has no value; raises ValueError for the log of another curriculum."""
+    """Return a metric of a log, if it has a value; ValueError for the log of another curriculum."""
     return scores(log, curriculum)[name].value
 
 
 def submitted_scores(submission: Submission) -> list[float]:
-    """Return the metric that is compared of each submitted run, as far as it has a value."""
+    """Return the compared metric of each submitted run with a value."""
     name = score_name(submission)
     found = []
     for run in submission.finished:
@@ -300,7 +295,7 @@ def submitted_scores(submission: Submission) -> list[float]:
 
 
 def check_of_scores(submission: Submission, found: Sequence[float], what: str, level: str, note: str = "") -> Check:
-    """Test whether scores are lower than the submitted ones, and say what the test would have found.
+    """Test whether scores are lower than the submitted ones, and say what the test could find.
 
     Args:
         submission: with the submitted scores.
@@ -322,12 +317,12 @@ def check_of_scores(submission: Submission, found: Sequence[float], what: str, l
 def verified(submission: Submission, results: Mapping[SubmittedRun, Rerun], other_bits: Sequence[str]) -> list[Check]:
     """Return the checks of all runs that were learned again.
 
-    Bits are compared first. Where they differ and are not promised, the scores of these runs are tested instead.
+    Bits are compared first. Where they differ and are not promised, scores are tested instead.
 
     Args:
         submission: of the runs.
         results: of each run that was learned again.
-        other_bits: why bits are not promised here; see `why_other_bits`.
+        other_bits: from `why_other_bits`.
     """
     name = score_name(submission)
     every: list[Check] = []

@@ -1,7 +1,6 @@
-"""Level *rescored* of a verification: a submission's logs are those that it names, and whole, and all rules hold.
+"""Level *rescored* of a verification: a submission's logs are those that it names, whole, and all rules hold.
 
-Its scores are computed from the logs, here and on a board. It runs no code of the submission. Logs may still be made
-up: a rerun finds that.
+Scores are computed from the logs; no code of the submission runs. Only a rerun finds logs that are made up.
 """
 
 from __future__ import annotations
@@ -33,10 +32,10 @@ RESCORED = LEVELS[0]
 NO_ROW: ReadOnlyValues = {}
 
 OF_OURS = "baselines."
-"""Beginning of the names of our classes."""
+"""Start of the names of our classes."""
 
 MAY_BE_READ = ("", "the frames of each block")
-"""What methods may read of tasks beside what the protocol gives: a track fixes the frames of its blocks."""
+"""What methods may read beside what the protocol gives: a track fixes the frames of its blocks."""
 
 
 class Check(NamedTuple):
@@ -59,7 +58,7 @@ class Check(NamedTuple):
 
 
 def differing(one: ReadOnlyValues, other: ReadOnlyValues) -> list[str]:
-    """Return the names that have other values in two mappings; None stands for none."""
+    """Return the names whose values differ between two mappings; None stands for none."""
     return [name for name in {**one, **other} if one.get(name) != other.get(name)]
 
 
@@ -69,7 +68,7 @@ def equal(what: str, expected: object, found: object, run: str = "") -> Check:
 
 
 def rescore(submission: Submission) -> list[Check]:
-    """Check what a submission says by its own files.
+    """Check a submission by its files.
 
     Raises:
         ValueError: for files that cannot be read.
@@ -82,10 +81,10 @@ def rescore(submission: Submission) -> list[Check]:
 
 
 def scores_of(submission: Submission, run: SubmittedRun) -> dict[str, float | None]:
-    """Return what a board shows of a finished run, from its log: the score of the track and `board_columns`.
+    """Return a board's values of a finished run, from its log: the track's score and `board_columns`.
 
     Raises:
-        ValueError: if the log is another one than the submission names, or of another curriculum.
+        ValueError: if the log is not the one that the submission names, or of another curriculum.
     """
     log = submission.log(run)
     own = log_sum(log) == run.log_sha256
@@ -124,13 +123,13 @@ def _of_the_whole(submission: Submission) -> Iterator[Check]:
 
 
 def _rules(what: str, rules: Sequence[Rule], expected: str, found: str) -> Check:
-    """Return a check of rules, with the messages of those that are broken."""
+    """Return a check of rules, with the messages of broken ones."""
     broken = "; ".join(message for holds, message in rules if not holds)
     return Check(what, expected, found, not broken, note=broken)
 
 
 def _of_the_log(submission: Submission, run: SubmittedRun, log: RunLog) -> Iterator[Check]:
-    """Yield checks of a log against what the other files say of its run."""
+    """Yield checks of a log against the other files."""
     yield equal("sum of the log", run.log_sha256, log_sum(log), run.run)
     about = (log.of_kind("run") or [{}])[0]
     config = dict(about.get("config") or {})
@@ -162,7 +161,7 @@ def _of_experts(submission: Submission, run: SubmittedRun, log: RunLog) -> Itera
 
 
 def of_the_protocol(submission: Submission, run: SubmittedRun, log: RunLog) -> Iterator[Check]:
-    """Yield checks that a log has the evaluations of the protocol, and frames to the end of the curriculum."""
+    """Yield checks that a log has all evaluations of the protocol and all frames of the curriculum."""
     curriculum = submission.curriculum
     how = submission.curriculum.evaluation
     yield equal("frames", curriculum.num_frames, log.ends()[-1], run.run)
@@ -200,7 +199,7 @@ def curriculum_rule(curriculum: Curriculum, of_track: Track | None) -> Rule:
 
 
 def seed_rules(seeds: Iterable[int], tuned: Iterable[int], of_track: Track | None) -> list[Rule]:
-    """Return the rules that the seeds are those of the track, if there is one, and that none was used for tuning."""
+    """Return the rules that seeds are those of the track, if any, and were not used for tuning."""
     own = set(seeds)
     used = own & set(tuned)
     rules = [(not used, f"seeds {listed(sorted(used))} are among tuning.seeds: submit runs of other seeds")]
@@ -220,14 +219,13 @@ def seed_rules(seeds: Iterable[int], tuned: Iterable[int], of_track: Track | Non
 
 
 def _ranges(seeds: Iterable[int]) -> str:
-    """Return seeds in words, such as ``0..9``."""
     ordered = sorted(seeds)
     whole = len(ordered) > 2 and ordered == list(range(ordered[0], ordered[-1] + 1))
     return f"{ordered[0]}..{ordered[-1]}" if whole else ", ".join(map(str, ordered))
 
 
 def entry_rule(config: ReadOnlyValues, entry_point: str | None) -> Rule:
-    """Return the rule that there is a way to run a configuration again."""
+    """Return the rule that a configuration can be run again."""
     agent = config.get("agent")
     is_built = isinstance(agent, Mapping) and "_target_" in agent
     fix = "set entry_point: module:function in method.yaml, a function (curriculum, seed, run_dir) that trains a run"
@@ -237,8 +235,8 @@ def entry_rule(config: ReadOnlyValues, entry_point: str | None) -> Rule:
 def oracle_rule(config: ReadOnlyValues) -> Rule:
     """Return the rule that a method or detector of ours reads no more of the tasks than the learner is given.
 
-    A class of `baselines` goes by the name of the module that defines it only: what other names stand for is unknown.
-    A method is built, as its settings decide; a detector, whose settings may ask for any memory, is not.
+    A class of `baselines` goes by the name of its defining module only. A method is built, as its settings decide; a
+    detector, whose settings may ask for any memory, is not.
     """
     kinds: dict[str, type] = {}
     unknown = []

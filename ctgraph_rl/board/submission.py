@@ -1,10 +1,10 @@
-"""A submission: a folder of files with which you can check what a method reached.
+"""A submission: a folder of files that show what a method reached.
 
 - ``submission.json``: an object of `PARTS`, with a run of `RUN` for each seed.
 - ``logs/RUN.jsonl.gz``: the log of each run; ``logs/RUN.expert_K.jsonl.gz``: of its single-task expert of task K.
 - ``verification.json``: what a verification found; not part of what was submitted.
 
-Scores are not stated: who reads a submission computes them from its logs. No code of the folder is ever run.
+Readers compute scores from the logs. No code of the folder is ever run.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ SCHEMA = 2
 """Of ``submission.json``."""
 
 MOST_BYTES, MOST_BYTES_OF_A_LOG = 2**24, 2**26
-"""Largest ``submission.json``, 16 MiB, and largest log, before and after it is unpacked, 64 MiB."""
+"""Largest ``submission.json``, 16 MiB, and largest log, packed and unpacked, 64 MiB."""
 
 MOST_RUNS, MOST_SECONDS = 10_000, 1e9
 """Of a submission, and of a run."""
 
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.=-]{0,119}")
-"""Names of runs, which are names of files."""
+"""Names of runs and of their files."""
 
 NOT_COUNTED = ("versions", "machine", "num_threads", "cpu", "source", "num_frames")
-"""Fields of a log's first line that its sum leaves out; the fingerprint stands for source and frames."""
+"""Fields of a log's first line outside its sum; the fingerprint stands for source and frames."""
 
 
 class Field(NamedTuple):
@@ -117,7 +117,7 @@ RUN = {
 
 @dataclass(frozen=True)
 class SubmittedRun:
-    """One of the ``runs``; see `RUN`."""
+    """One of the ``runs``, with the keys of `RUN`."""
 
     run: str
     seed: int
@@ -139,7 +139,7 @@ class SubmittedRun:
 
     @property
     def seeds(self) -> tuple[int, ...]:
-        """The seeds of its group; its own for a run without others."""
+        """The seeds of its group, or its one seed."""
         return self.group or (self.seed,)
 
 
@@ -149,12 +149,12 @@ class Submission:
 
     Args:
         path: its folder.
-        method: what ``method.yaml`` says.
-        config: the configuration of all runs, without the seed.
-        versions: of what computed them, by the names of packages.
+        method: from ``method.yaml``.
+        config: of all runs, without the seed.
+        versions: of packages that computed them, by name.
         curriculum: what they learned.
-        runs: sorted by their seeds.
-        track: the track that it is for; None: it is for none.
+        runs: sorted by seed.
+        track: that it is for, or None.
         digest: SHA-256 of ``submission.json``, which has the sums of all logs.
     """
 
@@ -176,16 +176,16 @@ class Submission:
         """Return the log of a run.
 
         Raises:
-            ValueError: if it is no log, or larger than a log may be.
+            ValueError: if it is no log, or too large.
             OSError: if it cannot be read.
         """
         return read_log(self.path / log_name(run.run))
 
     def experts(self, run: SubmittedRun, log: RunLog) -> list[RunLog] | None:
-        """Return the logs of the single-task experts that the log of a run names; None if it was trained without.
+        """Return the logs of the single-task experts of a run; None if it had none.
 
         Raises:
-            ValueError: see `log`.
+            ValueError: as `log`.
             OSError: if one of them cannot be read.
         """
         found = []
@@ -199,12 +199,12 @@ class Submission:
 
 
 def read_submission(path: Path | str, of_track: Track | None = None, config_dir: Path | None = None) -> Submission:
-    """Read a submission and check its form; `ctgraph_rl.board.rescore` checks what it says.
+    """Read a submission and check its form; `ctgraph_rl.board.rescore` checks its content.
 
     Args:
         path: its folder.
-        of_track: the track, in place of the one that its method names.
-        config_dir: where a track of the user's own is, as ``track/NAME.yaml``.
+        of_track: in place of the track that its method names.
+        config_dir: where the user's tracks are, as ``track/NAME.yaml``.
 
     Raises:
         ValueError: for what is no submission; names what is missing or wrong.
@@ -247,9 +247,9 @@ def read_submission(path: Path | str, of_track: Track | None = None, config_dir:
 
 
 def _curriculum(content: ReadOnlyValues, of_track: Track | None) -> Curriculum:
-    """Return what runs learned. Of tasks that are no CT-graphs, return our own curriculum of the same fingerprint.
+    """Return what runs learned; for other tasks than CT-graphs our curriculum of the same fingerprint.
 
-    Making their environments with arguments from a file could take any memory.
+    Environments with arguments from a file could take any memory.
     """
     tasks = content.get("tasks")
     if not isinstance(tasks, list) or not any(isinstance(task, dict) and "type" in task for task in tasks):
@@ -265,14 +265,13 @@ def _curriculum(content: ReadOnlyValues, of_track: Track | None) -> Curriculum:
 
 
 def _check_fields(given: Any, fields: Mapping[str, Field], what: str, owner: str = "") -> None:
-    """Refuse what is no object of these fields, each of its kind."""
+    """Refuse what is no object of these fields."""
     whole = isinstance(given, dict) and {*given} == {*fields}
     require((whole, f"{what} {', '.join(fields)}, got {given!r:.80}"))
     require(*kind_rules(given, {name: field.kind for name, field in fields.items()}, owner))
 
 
 def _run(given: Any) -> SubmittedRun:
-    """Return one of the runs."""
     owner = f" of {given.get('run')!r:.80}" if isinstance(given, dict) else ""
     _check_fields(given, RUN, "a run must have", owner)
     values = dict(given)
@@ -301,12 +300,12 @@ def submission_text(
 
 
 def log_name(run: str, expert: int | None = None) -> str:
-    """Return where the log of a run is in a submission, or that of its expert of a task from 1."""
+    """Return the place of a run's log in a submission, or that of its expert of a task from 1."""
     return f"{LOGS}/{run}{'' if expert is None else f'.expert_{expert}'}.jsonl.gz"
 
 
 def experts_of(log: RunLog) -> list[NamedValues]:
-    """Return what a log says of single-task experts, in the order of tasks; empty without any."""
+    """Return what a log says of single-task experts, in the order of tasks."""
     said: list[NamedValues] = []
     for line in log.of_kind("experts"):
         said += line.get("experts", ())
@@ -319,20 +318,20 @@ def experts_of(log: RunLog) -> list[NamedValues]:
 
 
 def packed(content: bytes) -> bytes:
-    """Return the content of a submitted log: equal bytes for equal logs."""
+    """Return the content of a submitted log, equal for equal logs."""
     return gzip.compress(content, mtime=0)
 
 
 def read_log(path: Path) -> RunLog:
-    """Read a log of a submission; see `unpacked` for errors, which may also be those of `RunLog.of_content`."""
+    """Read a log of a submission; errors as `unpacked` and `RunLog.of_content`."""
     return RunLog.of_content(unpacked(path, MOST_BYTES_OF_A_LOG), path)
 
 
 def unpacked(path: Path, most: int) -> bytes:
-    """Return the content of a submitted log; no more than ``most`` bytes of it are unpacked.
+    """Return the content of a submitted log; no more than ``most`` bytes are unpacked.
 
     Raises:
-        ValueError: if it is no file of gzip, or larger.
+        ValueError: if it is no gzip file, or larger.
         OSError: if it cannot be read.
     """
     with named(path):
@@ -348,8 +347,8 @@ def unpacked(path: Path, most: int) -> bytes:
 def log_sum(log: RunLog) -> str:
     """Return the SHA-256 of a log without times, versions and machine: equal for equal runs, bit for bit.
 
-    It is over a line of JSON for each measurement, with sorted keys. Settings that were added after the run, with their
-    value for "as before", do not count.
+    It is over a line of JSON with sorted keys for each measurement. Later settings with their value for "as before" do
+    not count.
     """
     found = hashlib.sha256()
     for measurement in log.measurements:
@@ -358,7 +357,7 @@ def log_sum(log: RunLog) -> str:
 
 
 def counted(measurement: ReadOnlyValues) -> NamedValues:
-    """Return what of a measurement counts in the sum of a log."""
+    """Return what of a measurement counts in the log's sum."""
     kept = without_time(measurement)
     if kept["kind"] != "run":
         return kept

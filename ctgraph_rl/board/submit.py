@@ -1,4 +1,4 @@
-"""The command ``ctgraph-rl submit``: finished runs become a folder of files that others can check."""
+"""The command ``ctgraph-rl submit``: finished runs become a folder that others can check."""
 
 from __future__ import annotations
 
@@ -49,17 +49,14 @@ def submit(
     of_track: Track | None = None,
     only: ReadOnlyValues | None = None,
 ) -> Submission:
-    """Make a submission of runs.
+    """Make a submission of runs; return it, read from its folder.
 
     Args:
         paths: run directories, or folders that hold them.
         to: the folder to make; must not exist.
-        method: what ``method.yaml`` holds; see `ctgraph_rl.board.method_yaml.read_method`.
-        of_track: the track that it is for; None: it is for none.
-        only: values of settings by dotted names, such as ``{"curriculum.depth": 4}``; runs with others are left out.
-
-    Returns:
-        The submission, read from its folder.
+        method: content of a ``method.yaml``, from `ctgraph_rl.board.method_yaml.read_method`.
+        of_track: the track that it is for, or None.
+        only: settings by dotted names, such as ``{"curriculum.depth": 4}``; runs with others are left out.
 
     Raises:
         ValueError: for runs that cannot be submitted; names every broken rule, before anything is written.
@@ -98,7 +95,7 @@ def submit(
 
 
 def _found(paths: Sequence[Path], only: ReadOnlyValues) -> list[Run]:
-    """Return the runs that have some settings, by seed; refuse what cannot be read."""
+    """Return the runs with some settings, by seed; refuse what cannot be read."""
     found, problems = find_runs(paths)
     require((not problems, why_left_out(problems)))
     chosen = []
@@ -117,7 +114,7 @@ def _found(paths: Sequence[Path], only: ReadOnlyValues) -> list[Run]:
 def _checked(
     runs: Sequence[Run], experts: Mapping[int, Mapping[int, Path]], method: ReadOnlyValues, of_track: Track | None
 ) -> Curriculum:
-    """Return what runs learned; refuse what cannot be submitted, with every broken rule."""
+    """Return what runs learned; refuse them with every broken rule."""
     seeds = [run.seed for run in runs]
     rules = [*same_rules(runs), *code_rules(runs), *failure_rules(runs, method["failed"])]
     rules += seed_rules(seeds, method["tuning"]["seeds"], of_track)
@@ -141,12 +138,12 @@ def _checked(
 
 
 def _experts(run: Run) -> dict[int, Path]:
-    """Return where the logs of a run's single-task experts are, by the numbers of their tasks."""
+    """Return the logs of a run's single-task experts by the numbers of their tasks."""
     return {each["task"]: Path(str(each.get("run"))) / LOG for each in experts_of(RunLog.read(run.path / LOG))}
 
 
 def _names(runs: Sequence[Run]) -> list[str]:
-    """Return a name for each run: that of its directory, or its seed where these are no different names of files."""
+    """Return each run's directory name, or its seed where names are equal or not fit for files."""
     names = [run.path.resolve().name for run in runs]
     usable = all(map(NAME.fullmatch, names)) and not repeated(map(str.lower, names))
     return names if usable else [f"seed{run.seed}" for run in runs]
@@ -179,7 +176,7 @@ def _line(run: Run, name: str, reason: str | None, experts: Mapping[int, Path]) 
 
 
 def same_rules(runs: Sequence[Run]) -> Iterator[Rule]:
-    """Yield the rules that all runs are of one configuration, one curriculum and one code."""
+    """Yield the rules that all runs have one configuration, curriculum and code."""
     nameless = [run.path for run in runs if run.agent is None]
     fix = 'give Recorder(about={"learner": ...})'
     yield not nameless, f"{listed(nameless)} do not name their learner: {fix}"
@@ -196,7 +193,7 @@ def same_rules(runs: Sequence[Run]) -> Iterator[Rule]:
 
 
 def _differing(given: Sequence[ReadOnlyValues], absent: object = None) -> dict[str, str]:
-    """Return the names that have several values, each with these in words."""
+    """Return the names that have several values, with these in words."""
     found = {}
     for name in dict.fromkeys(chain(*given)):
         values: dict[str, None] = {}
@@ -208,7 +205,7 @@ def _differing(given: Sequence[ReadOnlyValues], absent: object = None) -> dict[s
 
 
 def code_rules(runs: Sequence[Run]) -> Iterator[Rule]:
-    """Yield the rules that the code of all runs is known, and that it has not changed since."""
+    """Yield the rules that the code of all runs is known and unchanged."""
     unknown: list[Path] = []
     unsaid: list[Path] = []
     changed: dict[str, None] = {}
@@ -224,7 +221,7 @@ def code_rules(runs: Sequence[Run]) -> Iterator[Rule]:
 
 
 def _code_now(about: ReadOnlyValues) -> NamedValues:
-    """Return the code of this process, as far as a run's log names its parts; None for what cannot be found."""
+    """Return the code of this process for the parts that a run's log names; None for what is not found."""
     stored = about.get("sources") or {}
     found = find_sources(stored.keys() - {*SCRIPTS})
     sources = {**dict.fromkeys(stored), **found} if about.get("sources") is not None else None

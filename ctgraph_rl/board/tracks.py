@@ -1,8 +1,8 @@
 """Tracks of the board: named and versioned tasks, each a file in ``conf/track``.
 
 A track fixes curriculum, protocol, budget and seeds; agent, cell and method are free. ``ctgraph-rl -m track=small
-agent=ppo method=ewc`` runs exactly what the track ``small`` asks for. A ladder has several rungs, each with a
-separate curriculum, and a learner may be given less than the track gives: each of these is a `Variant`.
+agent=ppo method=ewc`` runs what the track ``small`` asks for. Each rung of a ladder has a curriculum, and a learner may
+be given less than the track gives: each of these is a `Variant`.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Protocol
 
 TUNING_SEEDS = range(100, 200)
-"""Seeds on which the hyperparameters of a submission may be chosen."""
+"""Seeds for choosing the hyperparameters of a submission."""
 
 HELD_OUT_SEEDS = range(10**6, 2**31)
 """Seeds that a verifier draws from."""
 
 KEYS = ("version", "title", "measures", "breakthrough", "score", "less_given")
-"""What a file says under ``track``."""
+"""Keys of a file's ``track``."""
 
 SCORES = (
     "adapted_return",
@@ -46,7 +46,7 @@ SCORES = (
     "search_efficiency",
     "tasks_learned",
 )
-"""Metrics that order a table; of each, more is better."""
+"""Metrics that order a table; more is better."""
 
 GROUP = "track"
 
@@ -56,8 +56,8 @@ class Variant:
     """What a submission to a track may learn.
 
     Args:
-        settings: how its curriculum differs from that of ``track=NAME``, as on the command line.
-        rung: which rung of a ladder it is, in words; empty if the track has one curriculum.
+        settings: changes of ``track=NAME``, as on the command line.
+        rung: of a ladder, in words; empty for one curriculum.
         curriculum: with protocol and evaluation.
     """
 
@@ -73,7 +73,7 @@ class Variant:
 
 @dataclass(frozen=True)
 class Track:
-    """A track, as its file in ``conf/track`` says it.
+    """A track, from its file in ``conf/track``.
 
     Args:
         name: of the file.
@@ -81,11 +81,11 @@ class Track:
         title: for readers.
         measures: a sentence.
         breakthrough: a sentence.
-        score: name of the metric that orders a table.
+        score: the metric that orders a table.
         seeds: of a submission.
-        rungs: settings of each rung of a ladder; one without settings for a track of one curriculum.
+        rungs: settings of each rung; one without settings for a single curriculum.
         less_given: changes of the protocol for learners that are given less.
-        config_dir: where its file is, if it is not one of ours.
+        config_dir: of the user's file; None: ours.
     """
 
     name: str
@@ -106,7 +106,7 @@ class Track:
 
     @cached_property
     def variants(self) -> tuple[Variant, ...]:
-        """What may be submitted: each rung as the track gives it, and then with less."""
+        """What may be submitted: each rung as the track gives it, then with less."""
         cfgs: dict[tuple[str, ...], Any] = {}  # each is composed once, as it takes 0.1 s
         found: list[Variant] = []
         for rung in self.rungs:
@@ -118,7 +118,7 @@ class Track:
 
     @cached_property
     def by_fingerprint(self) -> dict[str, Variant]:
-        """The variants by the fingerprints of their curricula."""
+        """The variants by their curricula's fingerprints."""
         return {each.curriculum.fingerprint: each for each in self.variants}
 
     @property
@@ -127,14 +127,13 @@ class Track:
         return self.variants[0].curriculum
 
     def variant_of(self, curriculum: Curriculum) -> Variant | None:
-        """Return the variant with this curriculum; None if the track has no such."""
+        """Return the variant with this curriculum, if any."""
         return self.by_fingerprint.get(curriculum.fingerprint)
 
     def draw_held_out_seeds(self, digest: str, number: int, count: int) -> tuple[int, ...]:
-        """Return different seeds that follow from a submission and a number of the verifier.
+        """Return different seeds that follow from a submission and a verifier's number.
 
-        Neither the submitter, who does not know the number, nor the verifier, who does not choose the digest, can pick
-        them.
+        Neither side can pick them: the submitter does not know the number, the verifier does not choose the digest.
         """
         require((is_int(number, 0), f"number must be an integer >= 0, got {number!r}"), *at_least_one(count=count))
         return held_out_seeds(f"{self.id} {digest} {number}", count)
@@ -155,7 +154,7 @@ class Track:
 
 
 def drawn(text: str, most: int) -> int:
-    """Return an integer in [0, most) that follows from a text by SHA-256; the first 8 bytes modulo ``most``."""
+    """Return an integer in [0, most) from a text: the first 8 bytes of its SHA-256 modulo ``most``."""
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") % most
 
 
@@ -170,7 +169,7 @@ def held_out_seeds(key: str, count: int) -> tuple[int, ...]:
 
 
 def given(protocol: Protocol, blocks: int) -> str:
-    """Return what a learner is given to know of tasks, in words; there are boundaries between several blocks."""
+    """Return in words what a learner is given to know of tasks; several blocks have boundaries."""
     parts = {"one_hot": ["task ids"], "at_boundaries": ["task ids at boundaries"], "hidden": []}[protocol.task_id]
     if blocks > 1 and protocol.announces and protocol.task_id != "at_boundaries":
         parts.append("boundaries")
@@ -180,10 +179,10 @@ def given(protocol: Protocol, blocks: int) -> str:
 
 
 def track(name: str, config_dir: Path | None = None) -> Track:
-    """Return a track by name; those of the user, ``track/NAME.yaml`` in ``config_dir``, come first.
+    """Return a track by name; the user's, ``track/NAME.yaml`` in ``config_dir``, come first.
 
     Raises:
-        ValueError: for an unknown name, with the one that was probably meant, and for a file that lacks a part.
+        ValueError: for an unknown name, with the likeliest one, and for a file that lacks a part.
     """
     homes: dict[str, Path] = {}
     ours = Path(conf_dir())
@@ -211,13 +210,13 @@ def track(name: str, config_dir: Path | None = None) -> Track:
 
 
 def tracks() -> tuple[Track, ...]:
-    """Return the tracks of this package; the small one is the first."""
+    """Return the tracks of this package, the small one first."""
     names = sorted(names_in(conf_dir(), GROUP), key=lambda name: (name != "small", name))
     return tuple(map(track, names))
 
 
 def _is_value(setting: str) -> bool:
-    """Return whether a setting is a value, such as ``curriculum.depth=2``, and not the choice of a group."""
+    """Return whether a setting is a value, such as ``curriculum.depth=2``, not the choice of a group."""
     return "." in setting.partition("=")[0]
 
 

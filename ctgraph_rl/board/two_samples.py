@@ -1,4 +1,4 @@
-"""Whether scores of runs that were made again are lower than the submitted ones: an exact test, and its power."""
+"""An exact test whether scores of repeated runs are lower than the submitted ones, and its power."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ import numpy as np
 from ctgraph_rl.checks import is_int, require
 
 ALPHA, POWER = 0.05, 0.8
-"""The chance to find a difference where there is none, at most; and to find one of the size that is stated."""
+"""The largest chance to find a difference that is not there, and the chance to find one of the stated size."""
 
 MOST_SPLITS = 1_000
-"""Ways to split the scores up to which all are tried; of more, as many random ones are."""
+"""Splits of the scores up to which all are tried; else as many random ones."""
 
 SAMPLES = 4_000
 """Of normal scores, for the power."""
@@ -26,7 +26,7 @@ ROUNDING = 1e-9
 
 
 class Difference(NamedTuple):
-    """What a comparison found, and what it would have found."""
+    """What a comparison found, and what it could have found."""
 
     submitted: float  # mean score
     found: float  # mean score of the runs that were made again
@@ -37,12 +37,12 @@ class Difference(NamedTuple):
 
     @property
     def is_lower(self) -> bool:
-        """Whether the scores that were found are lower than chance explains."""
+        """Whether the found scores are lower than by chance."""
         return self.p_value <= ALPHA
 
     @property
     def is_blind(self) -> bool:
-        """Whether no scores at all could have been found to be lower."""
+        """Whether no scores could have been found to be lower."""
         return math.isinf(self.detectable)
 
     def __str__(self) -> str:
@@ -57,15 +57,14 @@ class Difference(NamedTuple):
 
 
 def compare_samples(submitted: Sequence[float], found: Sequence[float]) -> Difference:
-    """Test whether scores are lower than submitted ones, by all ways to split them into groups of these sizes.
+    """Test whether scores are lower than submitted ones, over all splits into groups of these sizes.
 
-    The chance to call equal distributions different is at most `ALPHA`, whatever they are. The interval holds all drops
-    that the test does not exclude, on either side. The stated power is of normal scores with the standard deviation
-    within both groups.
+    The chance to call equal distributions different is at most `ALPHA`. The interval holds all drops that the test does
+    not exclude, on either side. The stated power is of normal scores with the standard deviation within both groups.
 
     Args:
-        submitted: scores of the submitted runs, one or more.
-        found: scores of the runs that were made again, one or more.
+        submitted: one or more scores of the submitted runs.
+        found: one or more scores of the repeated runs.
 
     Raises:
         ValueError: for a group without scores.
@@ -89,21 +88,18 @@ def compare_samples(submitted: Sequence[float], found: Sequence[float]) -> Diffe
 
 
 def runs_needed(submitted: int) -> int:
-    """Return how many runs must be made again at least, so that the test can find any drop."""
+    """Return the fewest repeated runs with which the test can find a drop."""
     require((is_int(submitted, 1), f"submitted must be an integer >= 1, got {submitted!r}"))
     return next(n for n in range(1, math.ceil(1 / ALPHA) + 1) if 1 / math.comb(submitted + n, n) <= ALPHA)
 
 
 @cache
 def detectable(submitted: int, found: int) -> float:
-    """Return the drop, in standard deviations of normal scores, that the test finds with a chance of `POWER`.
+    """Return the drop, in standard deviations of normal scores, found with a chance of `POWER`; infinite if none is.
 
     Args:
         submitted: number of submitted scores.
         found: number of the others.
-
-    Returns:
-        The drop; infinite if the test can find none with so few scores.
     """
     if 1 / math.comb(submitted + found, found) > ALPHA:
         return math.inf
@@ -125,7 +121,7 @@ def _p_values(submitted: np.ndarray, found: np.ndarray) -> np.ndarray:
 
 @cache
 def _splits(count: int, found: int) -> np.ndarray:
-    """Return who is in the last group, float64 [splits, count]: first the true one, then all or many random ones."""
+    """Return who is in the last group, float64 [splits, count]: first the true split, then all or many random ones."""
     if math.comb(count, found) <= MOST_SPLITS:
         chosen = [*combinations(range(count), found)][::-1]  # the true one is the last
     else:
@@ -137,7 +133,7 @@ def _splits(count: int, found: int) -> np.ndarray:
 
 
 def _first(holds: Callable[[float], object], low: float, high: float, halvings: int = 40) -> float:
-    """Return where a rule begins to hold between two numbers; -inf if it holds at the first."""
+    """Return where a rule begins to hold between two numbers; -inf if at the first."""
     if holds(low):
         return -math.inf
     for _ in range(halvings):

@@ -1,8 +1,8 @@
-"""Verify a submission: by its own files, by runs that are trained again, and by seeds, images and goals drawn for it.
+"""Verify a submission by its files, by repeated runs, and by seeds, images and goals drawn for it.
 
-rescored: its numbers are what its logs give; no code runs. rerun: drawn runs are trained again and give the same bits,
-or scores that are no lower where bits are not promised. held_out: other seeds, images and goals are learned, and the
-scores are no lower. A level needs those before it.
+rescored: its numbers follow from its logs; no code runs. rerun: drawn runs are trained again and give the same bits, or
+scores that are no lower where bits are not promised. held_out: other seeds, images and goals give scores that are no
+lower. A level needs those before it.
 """
 
 from __future__ import annotations
@@ -48,10 +48,10 @@ SCHEMA = 1
 """Of ``verification.json``."""
 
 LEAST_SECONDS = 600
-"""The time limit of a process is at least this."""
+"""Least time limit of a process."""
 
 MOST_HOURS, LEAST_GB, MOST_GB = 10**5, 0.001, 10**6
-"""What the limits of a process may be."""
+"""Bounds of a process's limits."""
 
 GB = 10**9
 
@@ -80,7 +80,7 @@ def planned(submission: Submission, arguments: argparse.Namespace) -> Plan:
     """Return what a verification runs: as many runs as asked for, and enough for a test where one is needed.
 
     Raises:
-        ValueError: for runs that cannot be made again here, and where the code of others cannot be isolated.
+        ValueError: for runs that cannot be repeated here, and where the code of others cannot be isolated.
     """
     other_bits = why_other_bits(submission, submission.runs)
     finished = len(submission.finished)
@@ -110,7 +110,7 @@ def limits_of(cell: RerunCell, arguments: argparse.Namespace) -> Limits:
 
 
 def longest(cells: Sequence[RerunCell]) -> RerunCell:
-    """Return what takes longest by the submitted times."""
+    """Return the longest process by the submitted times."""
     return max(cells, key=lambda cell: cell.seconds)
 
 
@@ -160,7 +160,7 @@ def code_in_words(submission: Submission) -> str:
 
 
 def is_of_this_package(name: str) -> bool:
-    """Return whether a dotted name is of something that this package defines, and not of what its modules import.
+    """Return whether this package defines a dotted name; names that its modules import do not count.
 
     Raises:
         ValueError: if another package has the name of one of ours.
@@ -179,10 +179,10 @@ def is_of_this_package(name: str) -> bool:
 
 
 def ask(lines: Sequence[str], yes: bool) -> None:
-    """Say what will run, and return if the user agrees.
+    """Say what will run, and ask the user to agree.
 
     Raises:
-        ValueError: without a terminal to ask, if ``yes`` is not given.
+        ValueError: without a terminal and without ``yes``.
         SystemExit: if the user does not agree.
     """
     print("\n".join(lines), flush=True)
@@ -195,9 +195,9 @@ def ask(lines: Sequence[str], yes: bool) -> None:
 
 
 def run_plan(plan: Plan) -> list[Check]:
-    """Run all processes of a plan in turn, and return the checks of what they leave.
+    """Run all processes of a plan in turn, and return the checks of their results.
 
-    What an earlier verification of the same number has finished is not run again.
+    Results of an earlier verification with the same number are kept.
     """
     arguments = plan.arguments
     code = [] if arguments.code is None else [arguments.code]
@@ -216,10 +216,10 @@ def run_plan(plan: Plan) -> list[Check]:
 
 
 def level_of(checks: Sequence[Check]) -> str:
-    """Return the highest level of which, and of those before it, all checks have passed.
+    """Return the highest level up to which all checks passed.
 
-    A submission whose files or reruns are not as it says has none. An open question, or lower scores on
-    held-out seeds, only keep it from the next level.
+    Files or reruns that contradict the submission leave no level. An open question, or lower held-out scores, only keep
+    it from the next level.
     """
     reached = NONE
     if any(check.passed is False and check.level != HELD_OUT for check in checks):
@@ -233,7 +233,7 @@ def level_of(checks: Sequence[Check]) -> str:
 
 
 def write_verification(submission: Submission, checks: Sequence[Check], plan: Plan | None = None) -> Path:
-    """Write ``verification.json`` into the folder of a submission; without a plan only files were checked."""
+    """Write ``verification.json`` into a submission's folder; without a plan only files were checked."""
     drawn: list[str] = []
     seeds: list[int] = []
     for cell in () if plan is None else plan.cells:
@@ -291,7 +291,7 @@ def verify(submission: Submission, arguments: argparse.Namespace) -> list[Check]
 
 @contextmanager
 def _ended_by_signals(message: str) -> Iterator[None]:
-    """Leave by an exception when asked to stop, so that processes are ended on the way, and print why."""
+    """Turn a signal to stop into an exception, so that processes are ended, and print why."""
 
     try:
         with sigterm_exits():
@@ -324,7 +324,7 @@ def _size_rule(option: str, value: object) -> Rule:
 
 
 def main() -> None:
-    """Verify a submission; the exit code is 1 unless it reaches the level that was asked for."""
+    """Verify a submission; the exit code is 1 unless it reaches the requested level."""
     made = parsers.verify()
     arguments = made.parse_args()
     with refused_by(made):

@@ -1,4 +1,4 @@
-"""One collective of a configuration: each member is an ordinary run in its own directory."""
+"""A collective of a configuration: each member is an ordinary run in its directory."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from ctgraph_rl.runs.session import Failures, RunMember, Session, mark_failure
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 LONG_ID = 1000
-"""Numbers of a one-hot task id above which a collective warns."""
+"""Length of a one-hot task id above which a collective warns."""
 
 
 def run_collective(cfg: Any, run_dir: Path) -> None:
@@ -77,7 +77,7 @@ def run_collective(cfg: Any, run_dir: Path) -> None:
 
 
 def _learn(session: Session, cfg: Any, cells: Sequence[ConfigAndPath], exchange: ExchangeLike, run_dir: Path) -> None:
-    """Build the objects of all members, let them learn, and write the results."""
+    """Build all members, let them learn, and write the results."""
     with Interrupt() as interrupt, mark_failure(run_dir):
         members = _members(cells, interrupt)
         _warn_of_long_ids([member.curriculum for member in members])
@@ -98,11 +98,11 @@ def _learn(session: Session, cfg: Any, cells: Sequence[ConfigAndPath], exchange:
 
 
 class Exchanging:
-    """A coupling of learners that each learn a curriculum and exchange messages; see `learn_collective`.
+    """A coupling of learners that exchange messages by `learn_collective`.
 
     Args:
         cfg: the configuration of the collective.
-        exchange: what they tell each other.
+        exchange: what messages they send.
         run_dir: the directory of the collective.
         checkpoints: those of all members together.
     """
@@ -115,7 +115,7 @@ class Exchanging:
         self.saved: RunState | None = None
 
     def resume(self, members: Sequence[RunMember]) -> Sequence[RunState | None]:
-        """See `SessionCoupling`."""
+        """Return the states to resume from."""
         self.checkpoints.tidy()
         self.saved = self.checkpoints.newest()
         return [None] * len(members) if self.saved is None else self.saved["members"]
@@ -123,7 +123,7 @@ class Exchanging:
     def learn(
         self, members: Sequence[RunMember], saved: Sequence[RunState | None], console: Console | None
     ) -> Failures:
-        """See `SessionCoupling`."""
+        """Let all members learn; return those that failed."""
         done = 0 if self.saved is None else self.saved["frames"]
         total = sum(member.curriculum.num_frames for member in members)
         blocks = max(len(member.curriculum.blocks) for member in members)
@@ -143,12 +143,12 @@ class Exchanging:
         return {}
 
     def end(self, members: Sequence[RunMember], failed: Failures) -> None:
-        """See `SessionCoupling`."""
+        """Write the collective's results."""
         write_summary(self.run_dir)
         self.checkpoints.clear()
 
     def _log(self, members: Sequence[RunMember]) -> RunLog:
-        """Return the collective's log, new or as it was at a checkpoint."""
+        """Return the collective's log, new or from a checkpoint."""
         run_dir = self.run_dir
         if self.saved is not None:
             (run_dir / METRICS).unlink(missing_ok=True)
@@ -166,7 +166,7 @@ class Exchanging:
 
 
 def _warn_of_long_ids(curricula: Sequence[Curriculum]) -> None:
-    """Say on standard error, before members learn, that their task ids make them slow and large."""
+    """Warn, before members learn, that long task ids make them slow and large."""
     longest = max(curricula, key=lambda each: each.protocol.length(len(each.tasks)))
     length = longest.protocol.length(len(longest.tasks))
     if longest.protocol.task_id == "one_hot" and length > LONG_ID:
@@ -179,7 +179,7 @@ def _warn_of_long_ids(curricula: Sequence[Curriculum]) -> None:
 
 
 def _members(cells: Sequence[ConfigAndPath], interrupt: Interrupt) -> list[RunMember]:
-    """Build the objects of all members.
+    """Build all members.
 
     Raises:
         ValueError: names the member.

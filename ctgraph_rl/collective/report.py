@@ -1,4 +1,4 @@
-"""A page on collectives: a table of learning time, returns and messages, figures, and the tidy tables of all."""
+"""A page on collectives: learning times, returns and messages, figures, and tidy tables."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ctgraph_rl.strict import files_below
 MEASURES = ("learning_time", "share_learned", "final_return")
 
 COLUMNS = (*RUN, "every", "drop_prob", "delay_prob", *MEASURES, *WHAT, "bytes", "helps")
-"""Of ``collectives.csv``: a row for each collective."""
+"""Of ``collectives.csv``, a row for each collective."""
 
 SHOWN = (
     *("curriculum", "agent", "method", "exchange", "num_members", "seed"),
@@ -39,14 +39,14 @@ MEANING = (
 )
 
 MOST_MAPS = 12
-"""Collectives whose map of help is drawn."""
+"""Most collectives whose map of help is drawn."""
 
 
 def find_collectives(paths: Sequence[Path | str]) -> list[Collective]:
-    """Return every finished collective in or below some folders; others are named on standard error.
+    """Return every finished collective in or below folders; others are named on standard error.
 
     Raises:
-        ValueError: if there is none; and see `read_collective`.
+        ValueError: if there is none; and as `read_collective`.
     """
     folders: dict[Path, None] = {}
     for path in paths:
@@ -66,14 +66,11 @@ def find_collectives(paths: Sequence[Path | str]) -> list[Collective]:
 
 
 def write_report(paths: Sequence[Path | str], folder: Path) -> Path:
-    """Write ``collectives.md`` with its figures, ``collectives.csv`` and the tidy tables of all collectives.
+    """Write ``collectives.md`` with its figures, ``collectives.csv`` and the tidy tables; return the page.
 
     Args:
         paths: directories of collectives, or folders that hold them.
         folder: where the report goes.
-
-    Returns:
-        The page.
 
     Raises:
         ModuleNotFoundError: before any work, without what the extra ``report`` installs.

@@ -1,7 +1,7 @@
-"""What a collective measured, from its directory: learning times of its members, messages, and who helped whom.
+"""Learning times of a collective's members, messages, and who helped whom.
 
-The first line of ``collective.jsonl`` names members and configuration, a line ``exchange`` has the counts of a kind of
-message, a line ``help`` is what a member took over. All else is made of it and of the members' logs.
+The first line of ``collective.jsonl`` names members and configuration, a line ``exchange`` counts a kind of message, a
+line ``help`` is what a member took over. All else follows from it and the members' logs.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ COLLECTIVE = "collective.jsonl"
 """The log of a collective."""
 
 FILES = (COLLECTIVE, "members.csv", "messages.csv", "helps.csv", METRICS)
-"""Files of a collective's directory, in the order in which they are written."""
+"""Files of a collective's directory, in the order of writing."""
 
 LAST = 5
 """Batches at the end of a block whose mean return is its final one, as in the raw data of MOSAIC."""
@@ -35,7 +35,7 @@ LAST = 5
 WHAT = (SENT, DELIVERED, DROPPED, DELAYED)
 
 RUN = ("curriculum", "agent", "method", "exchange", "num_members", "seed")
-"""First columns of all tables: which collective a row is of."""
+"""First columns of all tables: which collective a row belongs to."""
 
 
 class Learned(NamedTuple):
@@ -72,7 +72,7 @@ class Collective:
 
     @property
     def learning_time(self) -> float:
-        """Mean frames that a member needs to learn a block; what was not learned counts with all of its frames."""
+        """Mean frames that a member needs to learn a block; an unlearned block counts with all its frames."""
         return fmean(each.frames if each.frames_to_learn is None else each.frames_to_learn for each in self.learned)
 
     @property
@@ -82,7 +82,7 @@ class Collective:
 
     @property
     def final_return(self) -> float:
-        """Sum of the final returns of all members, each the mean over its blocks; blocks without one count 0."""
+        """Sum over members of the mean final return of their blocks; blocks without one count 0."""
         blocks = Counter(each.member for each in self.learned)
         values = []
         for each in self.learned:
@@ -118,7 +118,7 @@ def read_collective(path: Path | str) -> Collective:
 
 
 def _learned(path: Path, number: int, about: ReadOnlyValues) -> Iterator[Learned]:
-    """Yield what a member learned in each of its blocks; by returns, where tasks have no goal."""
+    """Yield what a member learned in each block; by returns, where tasks have no goal."""
     log = RunLog.read(member_folder(path, number) / LOG)
     trained = log.of_kind("run")[0]["trained"]
     start = 0
@@ -162,7 +162,7 @@ def describe_collective(collective: Collective) -> str:
 
 
 def write_summary(run_dir: Path) -> None:
-    """Write the tables of a collective whose members are finished and, last of all, its metrics."""
+    """Write the tables of a finished collective and, last, its metrics."""
     collective = read_collective(run_dir)
     for name, rows in tables([collective]).items():
         write_whole(run_dir / name, csv_text(rows))
@@ -170,7 +170,7 @@ def write_summary(run_dir: Path) -> None:
 
 
 def tables(collectives: Sequence[Collective]) -> dict[str, list[list[Any]]]:
-    """Return the tidy tables of one or of several collectives by their files' names, columns first."""
+    """Return the tidy tables of collectives by file name, columns first."""
     messages = ["round", "frames", "message", *WHAT, "bytes"]
     helps = ["round", "receiver", "sender", "block", "frames"]
     extra: set[str] = set()

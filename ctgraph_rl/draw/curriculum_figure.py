@@ -1,7 +1,4 @@
-"""The graphs and goals of a curriculum as a figure with a panel for each graph.
-
-The panels leave wait states out: there is one before each decision and end state.
-"""
+"""The graphs and goals of a curriculum as a figure, with a panel for each graph and without wait states."""
 
 from __future__ import annotations
 
@@ -40,7 +37,7 @@ def draw_graphs(curriculum: Curriculum, path: Path | str) -> None:
 
     Args:
         curriculum: any curriculum.
-        path: the picture to write; its ending decides the format.
+        path: the picture; its ending decides the format.
 
     Raises:
         ModuleNotFoundError: without matplotlib; names the extra to install.
@@ -63,7 +60,7 @@ def draw_graphs(curriculum: Curriculum, path: Path | str) -> None:
 
 
 def goals_by_graph(curriculum: Curriculum) -> dict[CTGraph, dict[Goal, str]]:
-    """For each graph its goals, each with a label of its decisions and the blocks that train it."""
+    """Return each graph's goals, labelled with decisions and the blocks that train them."""
     blocks: dict[CTGraph, dict[Goal, list[int]]] = {}
     for number, block in enumerate(curriculum.blocks, 1):
         for task in dict.fromkeys(ct_graphs(block.tasks, "a figure of graphs")):

@@ -1,4 +1,4 @@
-"""A task's graph in the DOT language of Graphviz, as plain text; Graphviz itself is not needed to write it."""
+"""A task's graph in the DOT language of Graphviz, written without Graphviz."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ SHAPES: Mapping[StateType, str] = {HOME: "house", WAIT: "circle", DECISION: "dia
 
 
 def to_dot(task: Task, name: str = "") -> str:
-    """All states with the ids they show, and all transitions with their actions; the goal has two lines around it.
+    """Return all states with the ids they show, and all transitions with their actions; the goal has a double line.
 
-    Of a tree with more than 1,024 end states the path to the goal is written, with one node for the branches left out
-    of each decision state.
+    Beyond 1,024 end states only the path to the goal is written, with one node for the other branches of each decision
+    state.
 
     Args:
         task: any task.
-        name: a title, any text.
+        name: a title.
     """
     return "\n".join(["digraph {", *(f"  {line};" for line in _statements(task, name)), "}", ""])
 

@@ -1,4 +1,4 @@
-"""A figure of what a task's states look like: images of each kind of state, and how they vary when they are read."""
+"""A figure of what a task's states look like, and how their images vary when they are read."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COLUMNS = 8
 INCHES = 0.72
 """Side of an image with the gap to the next."""
 ROW, GAP = 1.22, 0.06
-"""Height of a line and the gap between images, relative to that."""
+"""Height of a line and gap between images, relative to `INCHES`."""
 
 
 class ImageLine(NamedTuple):
@@ -33,14 +33,14 @@ class ImageLine(NamedTuple):
 
 
 def image_figure(task: Task, seed: int = 0) -> Any:
-    """A figure of the images of each kind of state, the first ones of each.
+    """Return a figure of the first images of each kind of state.
 
-    Where images vary on read, by noise, rotation or several instances, a line holds the image of one id and seven
-    observations of it; else eight ids of a kind.
+    Where images vary on read, by noise, rotation or instances, a line holds the image of one id and seven observations
+    of it; else eight ids of a kind.
 
     Args:
         task: any task.
-        seed: decides the observations.
+        seed: of the observations.
     """
     x = task.observations
     varies = x.read_noise or x.read_rotation or task.images.num_variants > 1
@@ -65,7 +65,7 @@ def _make_plain_lines(task: Task) -> list[ImageLine]:
 
 
 def _make_varied_lines(task: Task, seed: int) -> list[ImageLine]:
-    """A line for each of the first ids of each kind of state."""
+    """Return a line for each of the first ids of each kind of state."""
     shown: list[tuple[StateType, int]] = []
     for kind in StateType:
         shown += product([kind], _first_ids(task, kind, MOST_IDS))
@@ -88,7 +88,7 @@ def _stored(task: Task, ids: list[int]) -> Tensor:
 
 
 def _reads(task: Task, shown: list[tuple[StateType, int]], count: int, seed: int) -> Tensor:
-    """Observations of ids by rows whose states show no other, uint8 [ids, count, *shape]."""
+    """Return observations of ids, uint8 [ids, count, *shape], by rows that show no other."""
     rows: list[Task] = []
     kinds: list[int] = []
     for kind, number in shown:

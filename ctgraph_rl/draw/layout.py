@@ -1,7 +1,7 @@
-"""The layout of a tree and the states in it, for all pictures: leaves side by side, other nodes in the middle above.
+"""The layout of a tree for all pictures: leaves side by side, other nodes in the middle above.
 
-A small tree is laid out whole, a larger one as the paths to some of its nodes. Nodes are heap indices: branch a of
-node n is b * n + a, and the root is 0. Time and memory grow with the nodes laid out, not with the tree.
+A small tree is laid out whole, a larger one as the paths to some nodes. Nodes are heap indices: branch a of node n is b
+* n + a, and the root is 0. Time and memory grow with the nodes laid out only.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ctgraph_rl.tasks.task import Task
 HOME, WAIT, DECISION, END, FAIL = StateType
 
 Key = tuple[StateType, int]
-"""A state: its type and its node, the heap index that ``env.node`` gives. Home and fail have node 0."""
+"""A state: its type and its node, a heap index as in ``env.node``; home and fail have node 0."""
 
 HOME_KEY = (HOME, 0)
 FAIL_KEY = (FAIL, 0)
@@ -24,15 +24,15 @@ FAIL_KEY = (FAIL, 0)
 MOST_LEAVES = 32
 """End states up to which a tree is drawn whole."""
 MOST_PATHS = 8
-"""End states that are drawn of a larger tree."""
+"""End states drawn of a larger tree."""
 MOST_STUBS = 3
-"""Branches left out that are hinted at on each side of those drawn."""
+"""Stubs of left-out branches on each side of those drawn."""
 MOST_DIGITS = 14
-"""Characters up to which the decisions of a path are written out."""
+"""Characters up to which a path's decisions are written out."""
 
 
 class Edge(NamedTuple):
-    """A transition that an action makes, waiting in place and failing aside."""
+    """The transition of an action; waiting stays in place, failing leads aside."""
 
     start: Key
     end: Key
@@ -46,8 +46,8 @@ class Layout:
 
     Args:
         graph: the tree.
-        x: the place of every node drawn, in (0, 1); from top to bottom, and from left to right within a level.
-        level: the number of decisions taken at every node drawn.
+        x: of every node drawn, in (0, 1); top to bottom, then left to right.
+        level: decisions taken at every node drawn.
     """
 
     graph: CTGraph
@@ -66,7 +66,7 @@ class Layout:
 
     @property
     def stubs(self) -> list[tuple[int, float]]:
-        """Hints at branches left out: a node, and the x of a branch left or right of those drawn."""
+        """Stubs of left-out branches: a node, and the x of a branch left or right of those drawn."""
         b = self.graph.branching_factor
         reach = 2 / max(len(self.leaves), 3) / 7
         hints = []
@@ -83,7 +83,7 @@ class Layout:
 
     @property
     def left_out(self) -> dict[int, int]:
-        """The number of branches left out at each node where some are."""
+        """The number of branches left out by node."""
         b = self.graph.branching_factor
         return {node: b - len(drawn) for node, drawn in self._branches().items() if len(drawn) < b}
 
@@ -100,7 +100,7 @@ class Layout:
         return END if self.level[node] == self.graph.depth else DECISION
 
     def states(self, waits: bool = True) -> Iterator[Key]:
-        """Yield all states drawn but fail, from top to bottom; wait states among them or not."""
+        """Yield all states drawn but fail, from top to bottom, with or without wait states."""
         yield HOME_KEY
         for node in self.x:
             if waits:
@@ -108,7 +108,7 @@ class Layout:
             yield self.kind(node), node
 
     def edges(self, task: Task, waits: bool = True) -> Iterator[Edge]:
-        """Yield all transitions of a task between states; without wait states, to what these lead to."""
+        """Yield all transitions between states; without wait states, to what these lead to."""
         for node in self.x:
             here = self.kind(node), node
             above = (DECISION, self.graph.parent(node)) if node else HOME_KEY
@@ -119,7 +119,7 @@ class Layout:
 
 
 def lay_out(graph: CTGraph, ends: Iterable[int], most_leaves: int = MOST_LEAVES) -> Layout:
-    """Place the whole tree, or the paths to some of its nodes where it has more end states than ``most_leaves``.
+    """Place the whole tree, or the paths to some nodes if it has more than ``most_leaves`` end states.
 
     Args:
         graph: the tree.
@@ -151,7 +151,7 @@ def lay_out(graph: CTGraph, ends: Iterable[int], most_leaves: int = MOST_LEAVES)
 
 
 def shown_ids(task: Task, state: Key, level: int) -> tuple[int, int]:
-    """Return the first and the last id that a state may show.
+    """Return the first and last id that a state may show.
 
     Args:
         task: any task.
@@ -170,12 +170,12 @@ def shown_ids(task: Task, state: Key, level: int) -> tuple[int, int]:
 
 
 def write_ids(task: Task, state: Key, level: int) -> str:
-    """Return an id, or the first and the last one with a dash; arguments as `shown_ids`."""
+    """Return an id, or the first and last one with a dash; arguments as `shown_ids`."""
     first, last = shown_ids(task, state, level)
     return str(first) if first == last else f"{first}-{last}"
 
 
 def in_digits(decisions: Sequence[int], sign: str = "") -> str:
-    """Write decisions in short, as ``121``, or with a sign between them; a dot where one has two digits."""
+    """Return decisions as ``121``, or with a sign between them; a dot where one has two digits."""
     text = (sign if max(decisions) < 10 else ".").join(map(str, decisions))
     return text if len(text) <= MOST_DIGITS else f"{text[: MOST_DIGITS // 2]}...{text[-MOST_DIGITS // 2 :]}"

@@ -1,7 +1,6 @@
-"""Pictures of the rows of a batch: the current observation on the left, the tree and the position in it on the right.
+"""Pictures of a batch's rows: the observation on the left, the tree and the position in it on the right.
 
-Nothing here knows an environment: `render` depends only on its arguments. Trees are placed in pixels, drawn at
-twice the size in palette numbers, and brought to size and to RGB by the mean of 2x2 pixels.
+Trees are placed in pixels, drawn at twice the size in palette numbers, then reduced to RGB by the mean of 2x2 pixels.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ STATE_COLOURS: dict[StateType, tuple[int, int, int]] = {
     StateType.END: (0, 158, 115),
     StateType.FAIL: (213, 94, 0),
 }
-"""Blue, sky blue, orange, bluish green and vermillion of Okabe and Ito: distinct with any colour vision."""
+"""Blue, sky blue, orange, bluish green and vermillion of Okabe and Ito, distinct with any colour vision."""
 
 BACKGROUND = 5
 EDGE = 6
@@ -39,7 +38,7 @@ OUTLINE = 8
 WAY = 9
 EXTRA_COLOURS = ((255, 255, 255), (176, 176, 176), (204, 121, 167), (0, 0, 0), (0, 0, 0))
 PALETTE = np.array([*STATE_COLOURS.values(), *EXTRA_COLOURS], np.uint16)
-"""The colours by number; that of a state type is its value."""
+"""Colours by number; a state type's number is its value."""
 PANEL_GREY = 208
 OFF_GREY = 64  # around an observation, and where a one-hot vector is 0
 MIN_SIZE = 48
@@ -66,9 +65,9 @@ def render(
     """Draw every row: its observation and its tree with the goal and the current position.
 
     A star is below the goal, a thick dark line is the way so far, and the current state has a black outline. On failure
-    the outline is around the fail mark, top right, and a cross is where it happened: at a decision state, also for the
-    wait state before it, or at the wait state before an end. Of a tree too large for the width only the paths to the
-    current node and to the goal are drawn, with stubs for other branches. A small cross marks swapped branches.
+    the outline is around the fail mark, top right, and a cross marks the place: a decision state, also for the wait
+    state before it, or the wait state before an end. A small cross marks swapped branches. Of a tree too wide only the
+    paths to the current node and to the goal are drawn, with stubs for other branches.
 
     Args:
         tasks: the rows' tasks, N in all.
@@ -82,7 +81,7 @@ def render(
         uint8 [N, size, 2 * size, 3] on the CPU.
 
     Raises:
-        ValueError: for no rows, rows of different numbers, and a wrong shape or size.
+        ValueError: for no rows, different numbers of rows, and a wrong shape or size.
     """
     n = len(tasks)
     lengths = [len(tensor) for tensor in (state_type, node, goal_leaf, observation)]
@@ -100,7 +99,7 @@ def render(
 
 
 def _show(panels: Pixels, observation: Pixels) -> None:
-    """Put grey images in the middle of [N, size, size, 3]; cells are repeated, or shrunk by their maximum."""
+    """Centre grey images in [N, size, size, 3]; pixels are repeated, or shrunk by their maximum."""
     one_hot = observation.ndim == 2
     size = panels.shape[1]
     images = _grid(observation) if one_hot else observation[:, 0]
@@ -121,7 +120,7 @@ def _show(panels: Pixels, observation: Pixels) -> None:
 
 
 def _grid(vectors: Pixels) -> Pixels:
-    """One-hot [N, K] as [N, rows, columns]: the entries row by row in a nearly square grid."""
+    """Return one-hot [N, K] as [N, rows, columns], nearly square."""
     n, entries = vectors.shape
     columns = math.ceil(math.sqrt(entries))
     rows = math.ceil(entries / columns)
@@ -157,7 +156,7 @@ def _draw_row(task: Task, kind: int, node: int, goal_leaf: int, size: int) -> Pi
 
 @lru_cache(maxsize=128)
 def _picture(graph: CTGraph, size: int, nodes: tuple[int, ...]) -> tuple[Pixels, dict[Key, Mark]]:
-    """The canvas of the whole tree or of the paths to two nodes, and the places of all states on it."""
+    """Return the canvas of the whole tree or of the paths to two nodes, and the places of its states."""
     gap = 0.785 * size / (graph.depth + 1)
     home = Mark(size / 2, size / 14, min(size / 32, 0.5 * gap))
     fail = Mark(size * 0.925, size * 0.075, size / 25)
@@ -212,7 +211,7 @@ def _star(canvas: Pixels, mark: Mark, unit: float) -> None:
 
 @lru_cache(maxsize=1024)
 def _ring(inner: float, outer: float) -> NDArray[np.int64]:
-    """Offsets on the canvas between two circles, [m, 2]; those of a disc for a negative inner radius."""
+    """Offsets on the canvas between two circles, [m, 2]; a disc for a negative inner radius."""
     reach = math.ceil(outer * SCALE)
     axis = np.arange(-reach, reach + 1) / SCALE
     distance = np.hypot(axis[:, None], axis)
@@ -220,7 +219,7 @@ def _ring(inner: float, outer: float) -> NDArray[np.int64]:
 
 
 def _fill(canvas: Pixels, centres: NDArray[np.float64], offsets: NDArray[np.int64], colour: int) -> None:
-    """Colour the offsets around every centre (x, y) that lie on the canvas; the way goes beneath the states."""
+    """Colour the offsets around every centre (x, y), within the canvas and below the states."""
     middles = (centres * SCALE).round().astype(np.int64)
     points = (middles[:, None] + offsets).reshape(-1, 2).T
     inside = (points.min(0) >= 0) & (points.max(0) < len(canvas))
@@ -248,7 +247,7 @@ def _lines(canvas: Pixels, lines: Iterable[MarkLine], width: float, colour: int)
 
 
 def _to_rgb(canvas: Pixels) -> Pixels:
-    """Colours [size, size, 3], the mean of each pixel's parts; a colour's channels are looked up and added as one."""
+    """Return colours [size, size, 3], the mean of each pixel's parts."""
     packed = np.pad(PALETTE, ((0, 0), (0, 1))).view(np.uint64)[:, 0]
     parts = packed[canvas].reshape(len(canvas) // SCALE, SCALE, -1, SCALE)
     total = parts[:, 0, :, 0] + parts[:, 0, :, 1] + parts[:, 1, :, 0] + parts[:, 1, :, 1]

@@ -1,4 +1,4 @@
-"""Heat maps of how alike the tasks of a curriculum are."""
+"""Heat maps of how similar the tasks of a curriculum are."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ def draw_similarity(curriculum: Curriculum, path: Path | str) -> None:
 
     Args:
         curriculum: its tasks, in order of first appearance.
-        path: the picture to write; its ending decides the format.
+        path: the picture; its ending decides the format.
 
     Raises:
         ModuleNotFoundError: without matplotlib; names the extra to install.
-        ValueError: for tasks too large for a measure, and those that are no CT-graphs.
+        ValueError: for tasks too large for a measure, or other than CT-graphs.
     """
     tasks = ct_graphs(curriculum.tasks, "a figure of how alike tasks are")
     figure = new_figure(12, 7.6)
@@ -57,7 +57,7 @@ def _draw_matrix(axes: Any, matrix: Tensor, title: str) -> Any:
 
 
 def _draw_labels(axes: Any, labels: Sequence[str], is_lowest: bool, is_leftmost: bool) -> None:
-    """Name the tasks where no panel below, or to the left, names them: labels take most of the time of a figure."""
+    """Name the tasks at the outer panels only: labels take most of a figure's time."""
     if len(labels) > MOST_LABELS:
         axes.set(xlabel="task, from 0", ylabel="task, from 0")
         return

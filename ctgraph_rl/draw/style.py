@@ -1,4 +1,4 @@
-"""The style of all figures of trees: a colour and a shape for each kind of state, marks, lines and an empty figure.
+"""The style of all figures of trees: a colour and shape for each kind of state, marks and lines.
 
 A grey print and any colour vision keep the kinds apart.
 """
@@ -26,7 +26,7 @@ PlanePoint = tuple[float, float]
 
 
 def import_matplotlib() -> None:
-    """Import matplotlib, also where MPLBACKEND names a backend that is not there: figures of this package use none.
+    """Import matplotlib, also where MPLBACKEND names a missing backend: figures of this package use none.
 
     Raises:
         ModuleNotFoundError: without matplotlib.
@@ -45,7 +45,7 @@ def import_matplotlib() -> None:
 
 
 def new_figure(width: float, height: float) -> Any:
-    """Return an empty figure, sizes in inches.
+    """Return an empty figure, in inches.
 
     Raises:
         ModuleNotFoundError: without matplotlib; names the extra to install.
@@ -60,14 +60,14 @@ def new_figure(width: float, height: float) -> Any:
 
 
 def picture(figure: Any, form: str, dpi: float | None = None) -> bytes:
-    """Return a figure in a format, such as ``png``; without ``dpi`` with that of its style."""
+    """Return a figure in a format, such as ``png``; without ``dpi``, that of its style."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format=form, **({} if dpi is None else {"dpi": dpi}))
     return buffer.getvalue()
 
 
 def save_figure(figure: Any, path: Path | str, dpi: float = DPI) -> None:
-    """Write a figure into the file that the user has named; its ending decides the format, ``.png`` where it has none.
+    """Write a figure; the path's ending decides the format, ``.png`` where it has none.
 
     Raises:
         ValueError: for an unknown ending.
@@ -78,18 +78,18 @@ def save_figure(figure: Any, path: Path | str, dpi: float = DPI) -> None:
 
 
 def colour(number: int) -> str:
-    """Return a colour of `ctgraph_rl.draw.pixels`'s palette, such as that of a kind of state, as ``#rrggbb``."""
+    """Return a colour of `ctgraph_rl.draw.pixels`'s palette as ``#rrggbb``."""
     return "#" + "".join(f"{channel:02x}" for channel in PALETTE[number])
 
 
 def mark(kind: StateType, size: float) -> NamedValues:
-    """Return the style of a state for matplotlib; sizes in points."""
+    """Return matplotlib's style of a state, sizes in points."""
     shown = 0.85 * size if kind == StateType.DECISION else size  # a square on its corner is wide
     return _mark(MARKERS[kind], shown, colour(kind), edge_width=min(0.8, size / 10))
 
 
 def goal_mark(size: float) -> NamedValues:
-    """Return the style of a goal, the star of `ctgraph_rl.draw.pixels`."""
+    """Return matplotlib's style of a goal, the star of `ctgraph_rl.draw.pixels`."""
     return _mark("*", size, colour(GOAL), edge_width=0.8)
 
 
@@ -113,7 +113,7 @@ def draw_lines(axes: Any, lines: Sequence[Sequence[PlanePoint]], **style: Any) -
 
 
 def stub_lines(layout: Layout, places: Mapping[int, PlanePoint], height: float) -> list[list[PlanePoint]]:
-    """Return short lines from the states drawn half the way towards branches left out."""
+    """Return short lines from states half the way towards left-out branches."""
     lines = []
     for node, end in layout.stubs:
         x, y = places[node]

@@ -1,4 +1,4 @@
-"""A figure of one task: its graph with what its states show, or with what a policy does there."""
+"""A figure of one task: its graph with what its states show, or what a policy does there."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ Counted = Mapping[Any, float]
 PerAction = Mapping[Any, Any]
 
 ROOM, ROOM_FOR_NUMBERS = 30.0, 50.0
-"""Points between end states from which on actions, loops and ways to fail are drawn, and numbers at them."""
+"""Points between end states from which actions, loops and ways to fail are drawn, and numbers at them."""
 MOST_WAIT_LEVELS = 6
-"""Depth up to which wait states are drawn in a tree that is not drawn whole."""
+"""Depth up to which a tree that is not whole has wait states."""
 LARGEST_MARK = 24.0
 LEGEND_WIDTH = 5.5
 """Inches of a legend in one line."""
@@ -44,7 +44,7 @@ RING: dict[str, Any] = {"marker": "o", "markerfacecolor": "none", "markeredgecol
 
 
 def task_figure(task: Task, **overlays: Any) -> Any:
-    """A new figure of a size that fits, for `draw_task` with the same arguments."""
+    """Return a new figure of a size that fits `draw_task`, with the same arguments."""
     graph = task.graph
     side_by_side = graph.num_end_states if graph.num_end_states <= MOST_LEAVES else MOST_PATHS
     beside = 0.9 if overlays.get("policy") or overlays.get("values") else 0.65
@@ -63,24 +63,24 @@ def draw_task(
     ids: bool = True,
     legend: bool = True,
 ) -> None:
-    """Draw a task's graph: every state in the colour and shape of its kind, and a star at the goal.
+    """Draw a task's graph: each state in the colour and shape of its kind, and a star at the goal.
 
-    Wait states that may be stayed in have a loop, and dashed arrows are the actions that fail. Nodes hold the ids of
-    their observations, the first and the last where one is drawn. Of a tree with more than 32 end states only the paths
-    to the goal and to the end states visited most are drawn.
+    Wait states that may last have a loop; dashed arrows are actions that fail. Nodes hold the ids of their
+    observations, the first and the last where one is drawn. Of a tree with more than 32 end states only the paths to
+    the goal and to the most visited end states are drawn.
 
-    States are keys (state type, node), as ``env.state_type`` and ``env.node`` give them; home and fail have node 0.
-    What is not in a mapping is not drawn.
+    States are keys (state type, node), as in ``env.state_type`` and ``env.node``; home and fail have node 0. States
+    missing in a mapping have no overlay.
 
     Args:
-        axes: matplotlib axes, of their size when the picture is made.
+        axes: matplotlib axes, at their final size.
         task: any task.
-        visits: how often each state was visited, as `ctgraph_rl.play.visits.visits` counts: numbers in the nodes
-            instead of ids, and the width of edges.
-        policy: b + 1 action probabilities of each state, or its greedy action: numbers at edges, and the likeliest
-            action is black.
-        values: b + 1 numbers for each state, such as Q-values, which stand at the edges.
-        ids: observation ids in the nodes; False: the initials of the kinds.
+        visits: how often each state was visited, from `ctgraph_rl.play.visits.visits`: numbers in the nodes instead of
+            ids, and the width of edges.
+        policy: b + 1 action probabilities of each state, or its greedy action: numbers at edges; the likeliest action
+            is black.
+        values: b + 1 numbers for each state, such as Q-values, at the edges.
+        ids: observation ids in the nodes; False: initials of the kinds.
         legend: name shapes and colours below the tree.
     """
     _TaskPicture(axes, task, visits or {}, policy=policy or {}, values=values or {}, ids=ids).draw(legend)
@@ -229,7 +229,7 @@ class _TaskPicture:
         return write_ids(self.task, state, self.layout.level[state[1]]) if self.ids else INITIALS[state[0]]
 
     def _draw_goal(self) -> None:
-        """A star below the goal, and the decisions below every end state of a tree that is not drawn whole."""
+        """A star below the goal, and decisions below the end states of a tree that is not whole."""
         size = max(7.0, min(13.0, self.size))
         drop = -0.5 * self.size - 0.6 * size
         self.axes.plot(
@@ -255,7 +255,7 @@ class _TaskPicture:
         return offset_copy(self.axes.transData, fig=self.axes.figure, x=x, y=y, units="points")
 
     def _draw_ways_to_fail(self) -> None:
-        """A short dashed arrow to the right of each state where an action fails, as wide as that is likely."""
+        """A short dashed arrow at each state where an action fails, as wide as that is likely."""
         base = {"arrowstyle": "<|-", "linestyle": DASHES, "color": colour(FAIL), "shrinkB": 0, "mutation_scale": 6}
         for (kind, node), place in self.places.items():
             if kind in (WAIT, DECISION):
@@ -269,7 +269,7 @@ class _TaskPicture:
                 self._note(numbers, place, shift, va=beside, fontsize=6, color=colour(FAIL))
 
     def _wrong(self, state: Key) -> list[int]:
-        """The actions that fail in a state, those above b among them, which a curriculum's other tasks may have."""
+        """The actions that fail in a state, also those above b, of a curriculum's other tasks."""
         b = self.graph.branching_factor
         right = (WAIT_ACTION,) if state[0] == WAIT else range(1, b + 1)
         most = max(b + 1, len(self.policy.get(state, ())), len(self.values.get(state, ())))
@@ -302,7 +302,7 @@ class _TaskPicture:
         )
 
     def _room(self) -> float:
-        """Return the inches of the figure that the axes have, beside others."""
+        """Return the axes' inches of the figure."""
         spec = self.axes.get_subplotspec()
         return float(self.axes.figure.get_figwidth() / (1 if spec is None else spec.get_gridspec().ncols))
 

@@ -1,4 +1,4 @@
-"""The rows of a batch as text: where each row is, and its observation in blocks of grey."""
+"""The rows of a batch as text: the place of each, and its observation in grey blocks."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def as_text(tasks: Sequence[Task], state: RowState, observation: Tensor, white: 
 
 
 def _place(task: Task, kind: int, node: int, goal_leaf: int, step_count: int) -> str:
-    """Return where a row is, by branches: ``wait state after 1 2, step 4, goal 1 1``; and what is swapped."""
+    """Return a place by branches and swaps: ``wait state after 1 2, step 4, goal 1 1``."""
     graph = task.graph
     goal = _write_path(graph.path(graph.num_decision_states + goal_leaf))
     way = f" after {_write_path(graph.path(node))}" if node else ""
@@ -48,7 +48,7 @@ def _write_path(path: Sequence[int]) -> str:
 
 
 def _blocks(observation: NDArray[np.uint8], white: int) -> str:
-    """Return an image as lines of blocks of grey, two for each pixel; a vector as one line."""
+    """Return an image as lines of two grey blocks a pixel; a vector as one line."""
     pixels = observation.reshape(-1, observation.shape[-1]).astype(int)
     lines = []
     for levels in (pixels * 4 // white).clip(0, 4):

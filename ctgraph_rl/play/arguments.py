@@ -1,4 +1,4 @@
-"""The task and the policy that a command line names, for ``ctgraph-rl draw`` and ``ctgraph-rl play``."""
+"""The task and policy of a command line of ``ctgraph-rl draw`` or ``ctgraph-rl play``."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class Selection(NamedTuple):
 
     Args:
         task: the task.
-        name: what to call it.
-        policy: as for `evaluate`; None: none was named.
+        name: for readers.
+        policy: as for `evaluate`, or None.
         initial_state: of a recurrent policy.
         curriculum: that a trained policy learned.
     """
@@ -46,7 +46,7 @@ class Selection(NamedTuple):
         return Player(self.task, self.policy, self.initial_state, seed=seed, greedy=greedy, curriculum=self.curriculum)
 
     def visits(self, num_episodes: int, seed: int, greedy: bool = True) -> Visits:
-        """Count where the policy goes; as many episodes follow each other in a row as the curriculum says."""
+        """Count where the policy goes, with as many successive episodes in a row as the curriculum says."""
         assert self.policy is not None
         in_row = 1 if self.curriculum is None else self.curriculum.evaluation.episodes_per_row
         count = partial(visits, self.task, self.policy, self.initial_state, curriculum=self.curriculum)
@@ -54,10 +54,10 @@ class Selection(NamedTuple):
 
 
 def select(arguments: argparse.Namespace) -> Selection:
-    """Return the task and the policy that are named.
+    """Return the named task and policy.
 
     Raises:
-        ValueError: for names that are unknown and what does not go together.
+        ValueError: for unknown names and values that exclude each other.
         OSError: for files that cannot be read.
     """
     given = {name: getattr(arguments, name) for name in (*parsers.CHANGES, "goal")}

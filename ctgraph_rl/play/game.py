@@ -1,7 +1,7 @@
-"""A person plays a CT-graph in the terminal and sees what an agent sees; or watches how a policy plays.
+"""A person plays a CT-graph in the terminal and sees what an agent sees, or watches a policy.
 
-``ctgraph-rl play CT-SU-B1``, ``ctgraph-rl play --run RUN --task 2 --delay 0.5``. Where the input is no
-terminal, keys are read from its lines.
+``ctgraph-rl play CT-SU-B1``, ``ctgraph-rl play --run RUN --task 2 --delay 0.5``. Without a terminal, keys are read from
+lines.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from ctgraph_rl.tasks.images import white_level
 from ctgraph_rl.tasks.task import Task
 
 SHADES = " .:-=+*#%@"
-"""From black to white, where there are no colours."""
+"""From black to white, without colours."""
 WIDTH = 24
-"""Columns that an image takes at least; the pixels of a small one are repeated."""
+"""Least columns of an image; pixels of a small one are repeated."""
 VECTOR_COLUMNS = 16
 MOST_BRANCHES = 16
-"""Largest number of end states for which the whole tree is shown."""
+"""Most end states for which the whole tree is shown."""
 MOST_KEYS = 9
-"""Largest action that one key names; larger ones are typed as lines."""
+"""Largest action that one key names; others are typed as lines."""
 END_OF_INPUT = "\x04"
 
 OUTCOMES = {
@@ -54,12 +54,7 @@ One of {leaves:,} end states is the goal."""
 
 
 class Game:
-    """A player, what was reached so far, and how it is shown.
-
-    Args:
-        player: acts in the environment.
-        console: where it is shown.
-    """
+    """A player, its results so far, and the console that shows them."""
 
     def __init__(self, player: Player, console: Console) -> None:
         self.player = player
@@ -75,7 +70,7 @@ class Game:
         self._show("a new episode")
 
     def press(self, key: str) -> None:
-        """Do what a person's key says."""
+        """Act on a key."""
         if key == "?":
             self.console.print(self.truth())
         elif key == "r":
@@ -88,7 +83,7 @@ class Game:
             self.act(int(key))
 
     def act(self, action: int | None = None) -> None:
-        """Take a step, with the policy's action if there is none, and show what comes of it."""
+        """Take a step, with the policy's action if there is none, and show the result."""
         self.is_over = self.player.step(action)
         self._show(f"after action {self.player.action}")
         if self.is_over:
@@ -124,19 +119,19 @@ class Game:
         )
 
     def truth(self) -> Tree:
-        """The tree, with the goal and where the player is."""
+        """The tree, with the goal and the player's place."""
         env = self.player.env
         return truth(self.player.task, StateType(int(env.state_type)), int(env.node), int(env.goal_leaf))
 
 
 def truth(task: Task, kind: StateType, place: int, goal_leaf: int) -> Tree:
-    """A tree as text, with the goal and a place in it; of a large one the paths to both.
+    """Return a tree as text, with the goal and a place; of a large one the paths to both.
 
     Args:
         task: whose tree it is.
-        kind: the type of the state at the place.
+        kind: of the state at the place.
         place: its node.
-        goal_leaf: the number of the end state with the goal.
+        goal_leaf: number of the end state with the goal.
     """
     graph = task.graph
     goal = graph.num_decision_states + goal_leaf
@@ -166,10 +161,10 @@ def has_colours(console: Console) -> bool:
 
 
 def picture(observation: NDArray[np.uint8], white: float, colours: bool) -> Text:
-    """An observation in greys, two pixels a character cell one above the other; without colours in shades of ASCII.
+    """Return an observation in greys, two pixels a character cell one above the other, or in shades of ASCII.
 
     Args:
-        observation: uint8 [1, r, r], or [K] for a vector, which is shown in lines of 16.
+        observation: uint8 [1, r, r], or [K] for a vector, shown in lines of 16.
         white: the brightest level.
         colours: whether the terminal has them.
     """
@@ -200,9 +195,9 @@ def _shades(levels: NDArray[np.int_], times: int) -> Text:
 
 @contextmanager
 def keyboard(stream: TextIO, largest_action: int) -> Iterator[Iterator[str]]:
-    """The keys that are pressed, or the words of the lines where there is no terminal or more actions than digits.
+    """Yield pressed keys, or words of lines without a terminal or with more actions than digits.
 
-    The terminal is as before in the end, whatever happens.
+    The terminal is restored in any case.
     """
     if not stream.isatty() or largest_action > MOST_KEYS or os.name != "posix":
         yield (word for line in stream for word in line.split())
@@ -220,7 +215,7 @@ def keyboard(stream: TextIO, largest_action: int) -> Iterator[Iterator[str]]:
 
 
 def play(game: Game, keys: Iterable[str]) -> None:
-    """Let a person play until the keys end or one of them quits."""
+    """Let a person play until the keys end or one quits."""
     graph = game.graph
     rules = RULES.format(b=graph.branching_factor, d=graph.depth, leaves=graph.num_end_states)
     game.begin()
@@ -232,7 +227,7 @@ def play(game: Game, keys: Iterable[str]) -> None:
 
 
 def watch(game: Game, episodes: int, delay: float) -> None:
-    """Show a policy's episodes and what is behind them, with a pause of some seconds after each step."""
+    """Show a policy's episodes and the tree behind them, with a pause of ``delay`` seconds after each step."""
     for _ in range(episodes):
         game.begin()
         while not game.is_over:

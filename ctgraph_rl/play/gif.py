@@ -21,9 +21,9 @@ def save_gif(player: Player, path: Path | str, seconds: float = 0.6, size: int =
     Args:
         player: a task and the policy that acts.
         path: the file to write.
-        seconds: how long a picture stays.
+        seconds: of a picture.
         size: height in pixels, at least 48.
-        most_frames: pictures after which the film ends, whether the episode is over or not.
+        most_frames: pictures after which the film ends.
 
     Raises:
         ModuleNotFoundError: without pillow; names the extra to install.

@@ -1,4 +1,4 @@
-"""One row of an environment, step by step: its state and its end can be looked at, and anyone may act."""
+"""One row of an environment, step by step, whose states and end can be read."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from ctgraph_rl.tasks.task import Task
 
 
 class Player:
-    """Plays a task in its own environment. A policy's draws come from torch's global generator.
+    """Plays a task in a separate environment; a policy draws from torch's global generator.
 
     Args:
         task: what is played.
         policy: acts where no action is given, as for `evaluate`; None: an action must be given.
         initial_state: gives a recurrent policy's state for a number of rows.
-        seed: decides the environment.
+        seed: of the environment.
         greedy: most likely actions; False samples and explores as in training.
-        curriculum: whose task ids the policy sees, if its protocol shows them with observations.
+        curriculum: whose task ids the policy sees, if its protocol shows them.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class Player:
 
     @torch.no_grad()
     def step(self, action: int | None = None) -> bool:
-        """Take a step with an action, or with the policy's; True where the episode is over."""
+        """Take a step with an action, or the policy's; True where the episode is over."""
         if action is not None:
             acted = self.data.set("action", torch.tensor([action], dtype=torch.int64, device="cpu"))
         else:

@@ -1,4 +1,4 @@
-"""Visits of a policy to each state of a task, and the actions that it takes there."""
+"""Visits of a policy to each state of a task, and its actions there."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from ctgraph_rl.tasks.task import Task
 
 
 class Visits(NamedTuple):
-    """Counts over a number of episodes, by (state type, node); home and fail have node 0."""
+    """Counts over episodes, by (state type, node); home and fail have node 0."""
 
     counts: dict[tuple[StateType, int], int]
     """Steps that began in a home, wait or decision state, and episodes that ended in an end state or in fail."""
     actions: dict[tuple[StateType, int], list[float]]
-    """The share of each action in home, wait and decision states; those above b are of other tasks, and fail."""
+    """The share of each action in home, wait and decision states; those above b belong to other tasks and fail."""
 
 
 def visits(
@@ -39,17 +39,17 @@ def visits(
     episodes_per_row: int = 1,
     curriculum: Curriculum | None = None,
 ) -> Visits:
-    """Count visits and actions of a policy; ``draw_task(axes, task, visits=counts, policy=actions)`` draws it.
+    """Count visits and actions of a policy; ``draw_task(axes, task, visits=counts, policy=actions)`` draws them.
 
     Args:
         task: what is played.
-        policy: as for `evaluate`, with all that follows.
+        policy: as for `evaluate`.
         initial_state: gives a recurrent policy's state for a number of rows.
         num_episodes: episodes in all.
-        seed: decides the environment and, if not greedy, the policy's draws.
+        seed: of the environment and, if not greedy, of the policy's draws.
         greedy: most likely actions; False samples and explores as in training.
-        episodes_per_row: episodes one after the other, for goals that change and policies that learn in a trial.
-        curriculum: whose task ids the policy sees, if its protocol shows them with observations.
+        episodes_per_row: successive episodes of a row, for goals that change and policies that learn in a trial.
+        curriculum: whose task ids the policy sees, if its protocol shows them.
 
     Raises:
         ValueError: as `evaluate`.
@@ -57,7 +57,7 @@ def visits(
     seen: list[Tensor] = []
 
     class Watched:
-        """The policy, with a note of each row's state and action."""
+        """The policy, noting each row's state and action."""
 
         def __init__(self, env: CTGraphEnv) -> None:
             self.env = env
@@ -80,7 +80,7 @@ def visits(
 
 
 def _count(task: Task, steps: Tensor, ends: TensorDictBase) -> Visits:
-    """Counts of steps, int64 [S, 3] of state type, node and action, and of where episodes ended."""
+    """Return counts of steps, int64 [S, 3] of state type, node and action, and of ends."""
     first = task.graph.num_decision_states
     leaves = ends["leaf"].flatten().tolist()
     num_actions = max(task.graph.branching_factor, int(steps[:, 2].max())) + 1

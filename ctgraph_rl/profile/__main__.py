@@ -20,7 +20,7 @@ FOLDER = "hydra.sweep.dir"
 
 
 def main() -> None:
-    """Train where there are settings, and print the profile; the exit code is 1 if runs are not done or left out."""
+    """Train if there are settings, and print the profile; the exit code is 1 if runs are unfinished or left out."""
     parser = parsers.profile()
     arguments = parser.parse_args()
     settings = [word for word in arguments.words if "=" in word]
@@ -52,7 +52,7 @@ def main() -> None:
 
 
 def _train(settings: dict[str, str], config_dir: Path | None) -> bool:
-    """Run the sweep; return whether all cells are done, and leave where it could not begin."""
+    """Run the sweep; return whether all cells are done, and exit if it could not begin."""
     sys.argv = ["ctgraph-rl", "-m", *(f"{key}={value}" for key, value in settings.items())]
     if config_dir is not None:
         sys.argv.append(f"--config-dir={config_dir}")

@@ -1,4 +1,4 @@
-"""What agents without a property have: policies that count steps, and a search that acts at random."""
+"""Floors of agents without a property: policies that count steps, and a random search."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from ctgraph_rl.tasks.task import Task
 from ctgraph_rl.tasks.values import memoryless_ceiling, open_loop_ceiling, random_frames_to_goal
 
 NEGLIGIBLE = 1e-9
-"""Probability of episodes that are so long that they do not count."""
+"""Probability of long episodes that do not count."""
 
 STARTS = 20
 """Sequences of decisions from which the best is sought."""
 
 
 def best_without_memory(task: Task) -> float:
-    """Return the best mean return of a policy that sees the image and the number of the step, and remembers nothing.
+    """Return the best mean return of a policy that sees the image and the step's number, and remembers nothing.
 
-    It is at least that of the best memoryless policy, which may act at random, and of the best sequence of actions.
+    It is at least that of the best memoryless policy, which may act at random, and of the best action sequence.
     """
     return max(memoryless_ceiling(task), open_loop_ceiling(task), counting_ceiling(task))
 
 
 def counting_ceiling(task: Task) -> float:
-    """Return the best mean return of a policy that sees the image and the number of the step.
+    """Return the best mean return of a policy that sees the image and the step's number.
 
     It waits where it must. At a decision state it only knows when it is there: with random waits, an early decision is
     likely the first one. With a_t the decision at step t, success has the probability
@@ -51,7 +51,7 @@ def counting_ceiling(task: Task) -> float:
 
 
 def decisions_by_step(task: Task) -> tuple[float, tuple[int, ...]]:
-    """Return the success of such a policy where decision states share an image, and its decision at each step."""
+    """Return such a policy's success where decision states share an image, and its decision at each step."""
     return _best_by_step(task.graph.branching_factor, task.graph.wait_prob, task.goal_decisions)
 
 
@@ -72,7 +72,7 @@ def _best_by_step(branching_factor: int, wait_prob: float, goal: tuple[int, ...]
 
 
 def _improve(decisions: list[int], wait_prob: float, goal: tuple[int, ...]) -> float:
-    """Choose the decision of each step in turn, with all others fixed; return the probability of success."""
+    """Choose each step's decision in turn, with all others fixed; return the probability of success."""
     depth = len(goal)
     num_steps = len(decisions)
     later = [[0.0] * depth for _ in range(num_steps + 2)]  # success from the wait state of a level, by step
@@ -107,21 +107,21 @@ def _at(decisions: list[int], step: int) -> int:
 
 
 def _after(later: list[list[float]], step: int, level: int) -> float:
-    """Return the success after the right decision of a level, which leads to the next one's wait state at a step."""
+    """Return the success after the right decision of a level, which leads to the next wait state at a step."""
     if level + 1 == len(later[0]):
         return 1.0
     return later[min(step, len(later) - 1)][level + 1]
 
 
 def found_share(task: Task, num_frames: float) -> float:
-    """Return the probability that actions at random reach a goal within some frames.
+    """Return the probability that random actions reach a goal within some frames.
 
-    Successes come with the rate 1 / m, with the m frames of `random_frames_to_goal`, and so rarely that the first one
-    comes within n frames with probability 1 - exp(-n / m).
+    Successes come with the rate 1 / m, m = `random_frames_to_goal`, so rarely that the first one comes within n frames
+    with probability 1 - exp(-n / m).
     """
     return -math.expm1(-num_frames / random_frames_to_goal(task))
 
 
 def all_found_share(tasks: Sequence[Task], num_frames: Sequence[int]) -> float:
-    """Return the probability that actions at random reach each goal within the frames of its block."""
+    """Return the probability that random actions reach each goal within the frames of its block."""
     return prod(found_share(task, frames) for task, frames in zip(tasks, num_frames, strict=True))

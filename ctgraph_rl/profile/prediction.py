@@ -1,7 +1,7 @@
-"""How much of what comes next an agent's own model knows, on episodes of two policies that it did not choose.
+"""How much an agent's model knows of what comes next, on episodes of two policies that it did not choose.
 
-Half of the episodes are of a policy that acts at random, half of one that navigates: it waits where it must and decides
-at random. The agent's own behaviour does not matter.
+One policy acts at random; the other navigates: it waits where it must and decides at random. The agent's behaviour does
+not matter.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SEED = 230210887
 """Of the held-out episodes, the same for all agents."""
 
 TOLERANCE = 1e-3
-"""How far the sum of the probabilities of a row may be from 1."""
+"""Largest distance from 1 of a row's probabilities."""
 
 
 MOST_LETTERS = 300
@@ -64,7 +64,7 @@ def known_bits(folder: Path, agent_class: Any, task: Task) -> KnownBits:
 
     Args:
         folder: of the run.
-        agent_class: of its agent; None where it is not known.
+        agent_class: of its agent, if known.
         task: what it learned.
 
     Raises:
@@ -89,11 +89,11 @@ def known_bits(folder: Path, agent_class: Any, task: Task) -> KnownBits:
 def bits_of_model(model: Model, task: Task) -> KnownBits:
     """Return how much a model knows of a task's next observation and reward, and how much can be known.
 
-    All values are means over the same steps of the probability given to what came, so a model with the probabilities of
-    the exact model has exactly its value.
+    All values are means over the same steps of the probability given to what came, so a model with the exact
+    probabilities has exactly the exact model's value.
 
     Args:
-        model: an agent with ``predict_next``; see `ctgraph_rl.agent.Model`.
+        model: an agent with ``predict_next``, as `ctgraph_rl.agent.Model`.
         task: a surjective graph with one image for each kind of state.
 
     Raises:
@@ -123,7 +123,7 @@ def bits_of_model(model: Model, task: Task) -> KnownBits:
 
 
 def _choices(task: Task) -> TensorDictBase:
-    """Return all pairs of an image and a reward, [images * 2]; the reward is 0 or that of the goal."""
+    """Return all pairs of an image and a reward, 0 or the goal's, [images * 2]."""
     x = task.observations
     single = all(first == last for first, last in map(x.ids, StateType))
     plain = (task.goal_reward, task.fail_reward, task.step_reward, task.reward_std) == (1, 0, 0, 0)
@@ -190,8 +190,8 @@ def _place(task: Task, seen: Tensor, action: Tensor) -> Tensor:
 def _tables(task: Task, num_pairs: int) -> Tensor:
     """Return the probabilities of what comes next, float64 [2, images * 2 * (depth + 1) * 2, pairs].
 
-    The first are those of the best predictor without memory, the second those of the exact model. The rows count image,
-    whether the action waits, level and whether a decision was wrong, the last fastest.
+    The first are those of the best memoryless predictor, the second those of the exact model. Rows count image, whether
+    the action waits, level and whether a decision was wrong, the last fastest.
     """
     x = task.observations
     depth = task.graph.depth
@@ -220,10 +220,10 @@ def _tables(task: Task, num_pairs: int) -> Tensor:
 
 
 def _share_at_last_level(task: Task) -> float:
-    """Return which share of the steps that wait at a wait state are at the last one.
+    """Return the share of waits at a wait state that are at the last one.
 
-    There are as many episodes of each policy. A policy that waits with probability a leaves a wait state with
-    probability w = a (1 - p) / (1 - a p), and waits there a / (1 - a p) times. It decides with probability c.
+    Each policy has as many episodes. One that waits with probability a leaves a wait state with probability w = a (1 -
+    p) / (1 - a p), and waits there a / (1 - a p) times. It decides with probability c.
     """
     b = task.graph.branching_factor
     p = task.graph.wait_prob

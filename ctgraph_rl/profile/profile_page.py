@@ -1,4 +1,4 @@
-"""The page of a profile: tables, bars with intervals, the same numbers as CSV and in LaTeX, and gaps."""
+"""The page of a profile: tables, bars with intervals, and gaps, also as CSV and LaTeX."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ COLUMNS = ("agent", "property", "score", "low", "high", "n", "reason", "measured
 
 
 def write_profile(paths: Sequence[Path | str], folder: Path | str, agents: Sequence[str] = ()) -> Profiles:
-    """Write ``profile.md`` with its figure, ``profile.csv`` and ``profile.tex``; return the scores of `profile_scores`.
+    """Write ``profile.md`` with its figure, ``profile.csv`` and ``profile.tex``; return `profile_scores`.
 
     Args:
         paths: folders of runs.
@@ -81,7 +81,7 @@ def _figures(scores: Profiles) -> Iterator[CaptionedFigure]:
 
 
 def draw_profiles(scores: Profiles) -> Any:
-    """Return a figure of bars with intervals in the order of the paper, in the style that is set; a gap has no bar."""
+    """Return a figure of bars with intervals, in the paper's order and the present style; a gap has no bar."""
     shown = list(scores.items())[:MOST_AGENTS]
     titles = list(shown[0][1])
     figure = new_figure(WIDTH, 0.25 * WIDTH + 0.1 * WIDTH * len(shown))

@@ -1,4 +1,4 @@
-"""What a run says about a property: a value, the floor of an agent without the property, and the optimum."""
+"""A run's value of a property, the floor of an agent without the property, and the optimum."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ctgraph_rl.tasks.values import open_loop_ceiling
 
 
 class Measured(NamedTuple):
-    """The result of a seed. Over seeds the score is the mean of value - floor over the mean of optimum - floor."""
+    """The result of a seed; a score is the mean of value - floor over the mean of optimum - floor."""
 
     value: float
     floors: tuple[float, ...]  # one that is exact, or those of the controls, in the order of the property's
@@ -50,9 +50,9 @@ class Evidence(NamedTuple):
         return [performance[last[task], task].item() for task in range(len(self.tasks))]
 
     def curve(self, block: int) -> Tensor:
-        """The lowest return over the tasks of a block, counted from 1, at each evaluation in it, float64 [evaluations].
+        """The lowest return over the tasks of a block, from 1, at each evaluation in it, float64 [evaluations].
 
-        So a difficulty counts as reached where all of its goals are.
+        A difficulty is reached where all of its goals are.
         """
         curves = self.log.curves(self.curriculum.trained)
         return curves.performance[curves.of_block(block)][:, list(self.curriculum.trained[block - 1])].amin(1)
@@ -72,9 +72,9 @@ def above_ceilings(run: Evidence, controls: Sequence[Evidence], sizes: Sequence[
 
 
 def above_random_search(run: Evidence, controls: Sequence[Evidence], sizes: Sequence[int]) -> Measured:
-    """The mean over depths of the lowest return over their goals, above that of a search that acts at random.
+    """The mean over depths of the lowest return over their goals, above that of a random search.
 
-    It acts at random until it finds the goal of a block, and keeps it.
+    The search acts at random until it finds the goal of a block, and keeps it.
 
     Args:
         run: the run.
@@ -89,7 +89,7 @@ def above_random_search(run: Evidence, controls: Sequence[Evidence], sizes: Sequ
 
 
 def faster_than_random_search(run: Evidence, controls: Sequence[Evidence]) -> Measured:
-    """The mean area of all goals but the first, above that of a search that acts at random until it finds each goal.
+    """The mean area of all goals but the first, above that of a random search for each goal.
 
     An area is the mean of the evaluations in a block.
     """
@@ -120,11 +120,11 @@ def gains(run: Evidence, controls: Sequence[Evidence]) -> Measured:
 
 
 def held_out(run: Evidence, controls: Sequence[Evidence]) -> Measured:
-    """The lowest return over goals with held-out wait images, above that of a fixed sequence of actions.
+    """The lowest return over goals with held-out wait images, above that of a fixed action sequence.
 
-    A policy that is right, but acts at random at new images, waits with probability a = 1 / (b + 1) there. So it leaves
-    a wait state with probability w = a (1 - p) / (1 - a p), and reaches the goal of d decisions with probability
-    w^(d + 1), if that is more.
+    A policy that is right, but acts at random at new images, waits there with probability a = 1 / (b + 1). It leaves a
+    wait state with probability w = a (1 - p) / (1 - a p), and reaches the goal of d decisions with w^(d + 1), if that
+    is more.
     """
     tasks = ct_graphs(run.curriculum.evaluation.held_out, "a profile")
     last = {m["task"]: m["return_mean"] for m in run.log.of_kind("evaluation") if m.get("held_out")}
@@ -138,9 +138,9 @@ def held_out(run: Evidence, controls: Sequence[Evidence]) -> Measured:
 
 
 def searches(run: Evidence, controls: Sequence[Evidence]) -> Measured:
-    """The success rate over the first n episodes of a row with one of n goals, above that of always the same path.
+    """The success rate over the first n episodes of a row with one of n goals, above that of one fixed path.
 
-    The floor is 1 / n, the optimum the mean of min(1, i / n) over episodes i: the best search; see
+    The floor is 1 / n, the optimum the mean of min(1, i / n) over episodes i, by the best search of
     `ctgraph_rl.metrics.adaptation`.
     """
     found = run.log.adaptation()
@@ -150,9 +150,7 @@ def searches(run: Evidence, controls: Sequence[Evidence]) -> Measured:
 
 
 def predicts(run: Evidence, controls: Sequence[Evidence]) -> Measured:
-    """The bits that the agent's own model knows of what comes next, above those of the best memoryless predictor.
-
-    See `ctgraph_rl.profile.prediction.known_bits`.
+    """The bits that `ctgraph_rl.profile.prediction.known_bits` finds, above those of the best memoryless predictor.
 
     Raises:
         Undefined: for an agent without ``predict_next``, and a log without its agent.
@@ -166,7 +164,7 @@ def _parts(values: Sequence[Any], sizes: Sequence[int]) -> list[Sequence[Any]]:
     """Return values in groups of some sizes.
 
     Raises:
-        Undefined: where they are not as many.
+        Undefined: where the counts differ.
     """
     if sum(sizes) != len(values):
         raise Undefined(f"the property has {sum(sizes)} tasks, this curriculum has {len(values)}")
@@ -181,16 +179,16 @@ def _parts(values: Sequence[Any], sizes: Sequence[int]) -> list[Sequence[Any]]:
 MEASURES: Mapping[str, Callable[..., Measured]] = by_name(
     above_ceilings, above_random_search, faster_than_random_search, gains, held_out, searches, predicts
 )
-"""The measures by name, as a table of properties names them."""
+"""The measures by name, for a table of properties."""
 
 
 def measure(run: Evidence, controls: Sequence[Evidence], prop: Any) -> Measured:
-    """Return what a run says about a property of `curricula.profile.PROPERTIES`.
+    """Return what a run says about a property.
 
     Args:
         run: the run.
         controls: the runs of the property's controls, of the same agent and seed.
-        prop: the property.
+        prop: one of `curricula.profile.PROPERTIES`.
 
     Raises:
         Undefined: where the run has no value.

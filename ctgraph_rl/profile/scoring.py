@@ -1,4 +1,4 @@
-"""Scores of agents over seeds, read from the directories of runs of profile curricula."""
+"""Scores of agents over seeds, from runs of profile curricula."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ REPLACED = ("curriculum=", "seed=", "overwrite=")
 """Settings of a run that a command replaces."""
 
 OF_AGENTS = ("policy_for", "initial_state", "learn", "load_state_dict")
-"""Methods by which a class is known as one of an agent."""
+"""Methods that identify a class of agents."""
 
 
 class Score(NamedTuple):
-    """A score over seeds; without a value, the reason. Means over seeds stand beside it."""
+    """A score over seeds, with means over seeds; without a value, the reason."""
 
     value: float | None
     low: float | None = None
@@ -59,7 +59,7 @@ class Score(NamedTuple):
 
     @property
     def absolute(self) -> str:
-        """What was measured, the floor and the optimum."""
+        """The measured value, the floor and the optimum."""
         if self.measured is None:
             return "-"
         of = f" (best of {self.controls})" if self.controls else ""
@@ -67,14 +67,14 @@ class Score(NamedTuple):
 
 
 Profiles = Mapping[str, Mapping[str, Score]]
-"""For each agent the scores by the titles of the properties, in the order of the paper."""
+"""For each agent the scores by the properties' titles, in the paper's order."""
 
 
 def score_of(results: Sequence[Measured], controls: Sequence[str] = ()) -> Score:
     """Return the mean of value - floor over the mean of optimum - floor, within [0, 1], with a 95 % interval.
 
-    All seeds are in it: one without room adds value - floor to the first mean and 0 to the second. The floor is that of
-    the control with the best mean.
+    A seed without room adds value - floor to the first mean and 0 to the second. The floor is that of the control with
+    the best mean.
 
     Args:
         results: one for each seed, at least one.
@@ -100,7 +100,7 @@ def score_of(results: Sequence[Measured], controls: Sequence[str] = ()) -> Score
 
 
 def _exact_interval(results: Sequence[Measured]) -> tuple[float, float]:
-    """Return Gaffke's interval of the mean score, where floor and optimum are the same for all seeds."""
+    """Return Gaffke's interval of the mean score, for one floor and optimum of all seeds."""
     [floor] = results[0].floors
     room = results[0].optimum - floor
     scores = [(each.value - floor) / room for each in results]
@@ -110,8 +110,8 @@ def _exact_interval(results: Sequence[Measured]) -> tuple[float, float]:
 def _paired_interval(results: Sequence[Measured]) -> tuple[float, float]:
     """Return the scores r that no control contradicts.
 
-    With areas A of a seed and C of its control, both in [0, 1], r is the score above this control where the mean of
-    A - C - r(1 - C) is 0. Its values are within [-1, 1 - r], so r is contradicted where Gaffke's interval of their mean
+    With areas A of a seed and C of its control, both in [0, 1], r is the score above this control where the mean of A -
+    C - r(1 - C) is 0. Its values are within [-1, 1 - r], so r is contradicted where Gaffke's interval of their mean
     leaves out 0. The score is the lowest one above a control.
     """
     lows = []
@@ -135,7 +135,7 @@ def rest_of_gain(pairs: Sequence[tuple[float, float]], score: float) -> tuple[fl
 
 
 def _highest(pairs: Sequence[tuple[float, float]], holds: Callable[[tuple[float, float]], bool]) -> float:
-    """Return the highest score in [0, 1] whose `rest_of_gain` has a property that no higher one has; 0 if none."""
+    """Return the highest score in [0, 1] whose `rest_of_gain` has a property; 0 if none."""
     low = 0.0
     high = 1.0
     for _ in range(HALVINGS):
@@ -148,7 +148,7 @@ def _highest(pairs: Sequence[tuple[float, float]], holds: Callable[[tuple[float,
 
 
 class Results(NamedTuple):
-    """What the seeds of an agent have measured of a property; without any, the reason."""
+    """What an agent's seeds measured of a property; without any, the reason."""
 
     seeds: Mapping[int, Measured]
     reason: str = ""
@@ -156,14 +156,14 @@ class Results(NamedTuple):
 
 
 def profile_scores(paths: Sequence[Path | str], agents: Sequence[str] = ()) -> dict[str, dict[str, Score]]:
-    """Return the scores of all agents whose runs of profile curricula are in or below some folders.
+    """Return the scores of all agents with runs of profile curricula in or below some folders.
 
-    A property counts all seeds of an agent or none: it has a gap where a run is not finished, lacks a control of the
-    same seed, or was evaluated at other moments than its curriculum says. The reason names the run and a command.
+    A property counts all seeds of an agent or none. It has a gap where a run is unfinished, lacks a control of the same
+    seed, or was evaluated at other moments than its curriculum says. The reason names the run and a command.
 
     Args:
         paths: folders of runs, of ``ctgraph-rl profile`` or of a `ctgraph_rl.Recorder`.
-        agents: names and order of agents, see `ctgraph_rl.report.names.displayed`.
+        agents: names and order of agents, as for `ctgraph_rl.report.names.displayed`.
 
     Returns:
         For each agent its score by the title of each property. A modified curriculum counts where the published one has
@@ -179,7 +179,7 @@ def profile_scores(paths: Sequence[Path | str], agents: Sequence[str] = ()) -> d
 
 
 def score_of_results(results: Results) -> Score:
-    """Return `score_of` what seeds have measured, or a gap with its reason."""
+    """Return `score_of` the results, or a gap with its reason."""
     if not results.seeds:
         return Score(None, reason=results.reason)
     try:
@@ -189,7 +189,7 @@ def score_of_results(results: Results) -> Score:
 
 
 def profile_results(paths: Sequence[Path | str], agents: Sequence[str] = ()) -> dict[str, dict[str, Results]]:
-    """Return what each agent's seeds have measured, by the title of each property; see `profile_scores`."""
+    """Return what each agent's seeds measured, by the title of each property, as `profile_scores` reads it."""
     properties = profile_properties()
     names = {*properties}
     for prop in properties.values():
@@ -232,10 +232,10 @@ def _results(
 
 
 def _over_seeds(runs: RunsByName, name: str, prop: Any, read: dict[Path, Evidence]) -> dict[int, Measured]:
-    """Return what each seed has measured; each run is read once.
+    """Return what each seed measured; each run is read once.
 
     Raises:
-        Undefined: where one has not, with the reason and what gives it.
+        Undefined: where one measured nothing, with the reason and the remedy.
     """
     results = {}
     for seed, run in sorted(runs[name].items()):
@@ -258,11 +258,11 @@ def _over_seeds(runs: RunsByName, name: str, prop: Any, read: dict[Path, Evidenc
 
 
 def _evidence(run: Run) -> Evidence:
-    """Return what a run has measured, and what it learned.
+    """Return what a run measured, and what it learned.
 
     Raises:
-        Undefined: for a run that is not finished, one of another curriculum than published that is not stored, one of
-            an earlier version, and one that was evaluated at other moments than its curriculum says.
+        Undefined: for an unfinished run, an unpublished curriculum that is not stored, an earlier version, and other
+            moments of evaluation than its curriculum says.
     """
     if run.reason:
         raise Undefined(f"{run.path} has no results, {run.reason}: {_command(run)}")
@@ -284,7 +284,7 @@ def _evidence(run: Run) -> Evidence:
 
 
 def _lacking(log: RunLog, curriculum: Curriculum) -> str:
-    """Return how the evaluations of a log differ from those of its curriculum; empty where they do not."""
+    """Return how the evaluations of a log differ from those of its curriculum, if they do."""
     evaluator = Evaluator(curriculum, 0, RunLog())
     due: Counter[tuple[int, int]] = Counter()
     for frames in curriculum.moments:
@@ -299,7 +299,7 @@ def _lacking(log: RunLog, curriculum: Curriculum) -> str:
 
 
 def _command(run: Run, curriculum: str = "") -> str:
-    """Return the command that trains a run, or one of its agent and seed on another curriculum, in the same folder."""
+    """Return the command that trains a run, or another curriculum with its agent and seed, in the same folder."""
     curriculum = curriculum or run.group[0]
     typed = run.path / ".hydra" / "overrides.yaml"
     if not typed.exists():
@@ -310,7 +310,7 @@ def _command(run: Run, curriculum: str = "") -> str:
 
 
 def _agent_class(run: Run) -> Any:
-    """Return the class of a run's agent; None where it is no baseline and its module is not imported.
+    """Return the class of a run's agent; None if it is no baseline and its module is not imported.
 
     Nothing that a file names is imported, but for baselines.
     """
@@ -324,10 +324,10 @@ def _agent_class(run: Run) -> Any:
 
 
 def profile_properties() -> ReadOnlyValues:
-    """Return the properties of a profile by their curricula; see `curricula.profile`.
+    """Return the properties of `curricula.profile` by their curricula.
 
     Raises:
-        ValueError: see `check_packages`.
+        ValueError: as `check_packages`.
     """
     check_packages()
     return import_module("curricula.profile").PROPERTIES

@@ -1,4 +1,4 @@
-"""Tables of the board for readers and programs: Markdown, LaTeX, CSV and JSON."""
+"""Tables of the board as Markdown, LaTeX, CSV and JSON."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LEGEND = (
 
 
 NOT_IN_LATEX = ("method", "bytes of the agent", "steps")
-"""Columns that stand elsewhere in LaTeX, or are left out for want of room."""
+"""Columns that LaTeX leaves out or places elsewhere."""
 
 
 class BoardColumn(NamedTuple):
@@ -64,7 +64,7 @@ def columns(line: Standing) -> list[BoardColumn]:
 
 
 def notes(table: BoardTable) -> list[str]:
-    """Return what lines of a table need said: no rank, a verification that does not count, and seeds that failed."""
+    """Return notes on lines: no rank, a verification that does not count, and failed seeds."""
     found = []
     for line in table.standings:
         why = line.entry.why_not_ranked
@@ -77,7 +77,7 @@ def notes(table: BoardTable) -> list[str]:
 
 
 def facts(table: BoardTable) -> list[tuple[str, str]]:
-    """Return what a table's tasks allow, with the budget and the seeds."""
+    """Return what a table's tasks allow, with budget and seeds."""
     curriculum = table.variant.curriculum
     seeds = table.track.seeds
     whole = seeds == tuple(range(seeds[0], seeds[-1] + 1))
@@ -90,7 +90,7 @@ def facts(table: BoardTable) -> list[tuple[str, str]]:
 
 
 def verdicts(table: BoardTable) -> list[tuple[str, str, str]]:
-    """Return each comparison of a table: the pair, the difference of the scores, and the corrected p-value."""
+    """Return each comparison of a table: the pair, the difference of scores, and the corrected p-value."""
     shown = []
     for (one, other), found in table.pairs.items():
         unclear = "" if is_significant(found) else ", not distinguishable"

@@ -1,4 +1,4 @@
-"""The command ``ctgraph-rl board``: a page with tables of submissions, and the same tables for programs."""
+"""The command ``ctgraph-rl board``: a page with tables of submissions, and the tables for programs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ADDRESS = re.compile(r"https?://\S+")
 
 
 class Board(NamedTuple):
-    """The page that was written, its tables, and what was left out."""
+    """The page, its tables, and what was left out."""
 
     page: Path
     tables: list[BoardTable]
@@ -46,11 +46,11 @@ def write_board(
     Args:
         paths: folders of submissions, or folders that hold them.
         folder: where the files go.
-        config_dir: where tracks of the user are, as ``track/NAME.yaml``.
+        config_dir: where the user's tracks are, as ``track/NAME.yaml``.
 
     Raises:
         ModuleNotFoundError: before any work, without what the extra ``report`` installs.
-        ValueError: if there is no submission that can be read.
+        ValueError: if no submission can be read.
     """
     require_packages("the board", "jinja2", "scipy")
     entries, problems = read_entries(paths, config_dir)
@@ -71,7 +71,7 @@ def write_board(
 
 
 def html(made: Sequence[BoardTable], problems: Sequence[Problem] = ()) -> str:
-    """Return the page: without JavaScript plain tables, with it tables that are sorted and filtered."""
+    """Return the page: plain tables, which JavaScript sorts and filters."""
     here = Path(__file__)
     script = here.with_name("board.js").read_text(encoding="utf-8")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
@@ -91,7 +91,7 @@ def html(made: Sequence[BoardTable], problems: Sequence[Problem] = ()) -> str:
 
 
 def link_of(entry: BoardEntry) -> str | None:
-    """Return the address of the paper of an entry, else of its code; None if neither is one."""
+    """Return the address of an entry's paper, else of its code, else None."""
     addresses = (str(entry.method["paper"]), str(entry.method["code"]["repository"]))
     return next(filter(ADDRESS.fullmatch, addresses), None)
 

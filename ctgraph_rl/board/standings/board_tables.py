@@ -1,8 +1,8 @@
-"""Tables of the board: entries that learned the same and were given the same, with ranks as far as seeds decide them.
+"""Tables of the board: entries that learned the same under the same conditions, with ranks as far as seeds decide them.
 
-Entries of other tracks, versions, rungs or protocols are in other tables. Within one, every two entries are compared
-seed by seed, and p-values are corrected by Holm's procedure for all pairs. An entry is at best behind all that are
-significantly better, and at worst before all that are significantly worse: its rank is that range.
+Other tracks, versions, rungs or protocols are other tables. Within one, every two entries are compared seed by seed,
+and p-values are corrected for all pairs by Holm's procedure. An entry's rank is a range: at best behind all that are
+significantly better, at worst before all that are significantly worse.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ class Standing:
 
     Args:
         entry: what stands there.
-        name: of the method, which no other line of the table has.
+        name: of the method, unique in the table.
         estimates: of the score and the other measures, over seeds.
-        best_rank: the best rank that the comparisons leave open; None for an entry without rank.
-        worst_rank: the worst one.
+        best_rank: that the comparisons leave open; None without rank.
+        worst_rank: likewise.
     """
 
     entry: BoardEntry
@@ -54,13 +54,13 @@ class Standing:
 
 @dataclass(frozen=True)
 class BoardTable:
-    """Entries that are comparable, the best score first.
+    """Comparable entries, the best score first.
 
     Args:
         track: of all entries.
         variant: what all learned.
         standings: the lines.
-        pairs: comparisons of the scores of every two entries with a rank, by their names.
+        pairs: comparisons of the scores of every two ranked entries, by name.
     """
 
     track: Track
@@ -85,7 +85,7 @@ class BoardTable:
 
 
 def tables(entries: Iterable[BoardEntry]) -> list[BoardTable]:
-    """Return a table for all entries that are comparable, in the order of tracks, rungs and what is given."""
+    """Return a table for all comparable entries, in the order of tracks, rungs and what is given."""
     groups = split_by(entries, lambda entry: (entry.track.id, entry.variant.curriculum.fingerprint))
     made = map(_table, groups.values())
 
@@ -97,7 +97,6 @@ def tables(entries: Iterable[BoardEntry]) -> list[BoardTable]:
 
 
 def _table(entries: Sequence[BoardEntry]) -> BoardTable:
-    """Return the table of comparable entries."""
     lines = list(map(Standing, entries, names_of(entries), map(_estimates, entries)))
     lines.sort(key=lambda line: (line.score.value is None, -(line.score.value or 0.0), line.name))
     ranked = [line for line in lines if line.entry.why_not_ranked is None]
@@ -109,7 +108,7 @@ def _table(entries: Sequence[BoardEntry]) -> BoardTable:
 
 
 def _estimates(entry: BoardEntry) -> dict[str, Estimate]:
-    """Return each measure of an entry over seeds, with the interval that the package's rules give it."""
+    """Return each measure of an entry over seeds, with the package's interval for it."""
     bounds = bounds_of_curriculum(entry.variant.curriculum)
     return {name: bounds.estimate(name, values) for name, values in entry.values.items()}
 
@@ -135,5 +134,5 @@ def _ranked(line: Standing, pairs: Mapping[tuple[str, str], Comparison], count: 
 
 
 def is_significant(found: Comparison) -> bool:
-    """Return whether a difference is one after the correction for all pairs."""
+    """Return whether a difference is significant after the correction."""
     return found.holm is not None and found.holm <= 1 - LEVEL

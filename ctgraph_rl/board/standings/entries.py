@@ -1,4 +1,4 @@
-"""Submissions as entries of the board: what a table needs of them, and how far they were verified."""
+"""Submissions as entries of the board, and how far they were verified."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LEVELS = ("failed", "submitted", "rescored", "rerun", "held_out")
 """How far a submission was verified, in rising order; ``failed``: a verification found a difference."""
 
 OF_FILES = {"none": "failed", **{level: level for level in LEVELS[2:]}}
-"""Levels by the names that ``verification.json`` gives them."""
+"""Levels by their names in ``verification.json``."""
 
 MOST_BYTES = 2**24
 """Largest ``verification.json`` that is read."""
@@ -55,14 +55,14 @@ class BoardEntry:
 
     Args:
         digest: of the submission.
-        method: what its ``method.yaml`` says.
+        method: from ``method.yaml``.
         track: that it is for.
         variant: what it learned.
         verification: how far it was verified.
         seeds: of the track.
-        values: of the track's score and `board_columns`, one for each seed; None for a seed without a value.
+        values: of the track's score and `board_columns`, one for each seed, or None.
         failed: why seeds failed.
-        agent_bytes: of the largest agent; None where no run left one.
+        agent_bytes: of the largest agent, if a run left one.
         folder: of the submission.
     """
 
@@ -89,7 +89,7 @@ class BoardEntry:
 
     @property
     def verified(self) -> str:
-        """The level in words, and that only scores were tested where bits were not."""
+        """The level in words, also whether scores were tested in place of bits."""
         reran = self.level in LEVELS[3:]
         return shown_level(self.level) + (", scores" if reran and not self.verification.bits else "")
 
@@ -105,7 +105,7 @@ class BoardEntry:
 
     @property
     def hours(self) -> float | None:
-        """Hours of computing of its runs, as the submission says."""
+        """Hours of computing of its runs, by the submission."""
         return self.method["compute"]["hours"]
 
     @property
@@ -115,7 +115,7 @@ class BoardEntry:
 
     @property
     def why_not_ranked(self) -> str | None:
-        """Why it has no rank; None for one that is ranked."""
+        """Why it has no rank, if it has none."""
         without = [str(seed) for seed, value in zip(self.seeds, self.scores, strict=True) if value is None]
         if self.level == "failed":
             return "its verification found differences"
@@ -127,7 +127,7 @@ def read_entries(paths: Iterable[Path | str], config_dir: Path | None = None) ->
 
     Args:
         paths: folders of submissions, or folders that hold them.
-        config_dir: where tracks of the user are, as ``track/NAME.yaml``.
+        config_dir: where the user's tracks are, as ``track/NAME.yaml``.
     """
     found: dict[str, BoardEntry] = {}
     problems: list[Problem] = []
@@ -154,7 +154,7 @@ def make_entry(submission: Submission) -> BoardEntry:
     """Return a submission as an entry.
 
     Raises:
-        ValueError: if it is for no track, or not of the track that it names, and for values out of a metric's bounds.
+        ValueError: if it is not of the track that it names, and for values out of a metric's bounds.
     """
     track = submission.track
     name = submission.method["name"]
@@ -197,7 +197,7 @@ def make_entry(submission: Submission) -> BoardEntry:
 
 
 def verification_of(submission: Submission) -> Verification:
-    """Return how far a submission was verified; what is of other files, or no verification, counts for nothing."""
+    """Return how far a submission was verified; a verification of other files counts for nothing."""
     path = submission.path / VERIFICATION
     if not path.is_file():
         return Verification("submitted")
@@ -213,7 +213,7 @@ def verification_of(submission: Submission) -> Verification:
 
 
 def _check_verification(given: Any) -> None:
-    """Refuse what is no ``verification.json``, or one whose level does not follow from its checks."""
+    """Refuse what is no ``verification.json``, or a level that does not follow from its checks."""
     require((isinstance(given, dict), f"it must be an object, got {given!r:.80}"))
     unknown = [name for name in given if name not in FIELDS]
     present = {name: given.get(name) for name in ("schema", "level", "checks")}
@@ -226,7 +226,7 @@ def _check_verification(given: Any) -> None:
 
 
 def _is_check(value: Any) -> bool:
-    """Whether it has what a `Check` has, texts and whether it passed."""
+    """Whether it has the fields of a `Check`."""
     if not isinstance(value, dict) or not {*value} <= {*Check._fields}:
         return False
     texts = {type(each) for name, each in value.items() if name != "passed"}
@@ -239,7 +239,7 @@ KINDS = {
     "bits": Kind(lambda value: isinstance(value, bool), "true or false"),
     "checks": list_of(Kind(_is_check, ""), "a list of checks with what, level and passed"),
 }
-"""Of ``verification.json``, as far as a board reads it."""
+"""Fields of ``verification.json`` that a board reads."""
 
 
 def shown_level(level: str) -> str:
@@ -248,6 +248,6 @@ def shown_level(level: str) -> str:
 
 
 def names_of(entries: Sequence[BoardEntry]) -> list[str]:
-    """Return a name for each entry: that of its method, with digits of the digest where two have the same."""
+    """Return each entry's method name, with digits of the digest where two are equal."""
     several = repeated(entry.name for entry in entries)
     return [f"{entry.name} ({entry.id})" if entry.name in several else entry.name for entry in entries]

@@ -1,4 +1,4 @@
-"""What the tasks of a curriculum allow in the mean, computed and not measured."""
+"""Computed means of what the tasks of a curriculum allow."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ctgraph_rl.tasks.values import is_needle, memoryless_ceiling, open_loop_cei
 
 
 class Ceilings(NamedTuple):
-    """Means over the tasks of a curriculum, undiscounted; None where there is no closed form."""
+    """Undiscounted means over the tasks of a curriculum; None where there is no closed form."""
 
     optimal: float | None  # of a policy that knows the goal
     one_policy: float | None  # of the best policy that does not distinguish tasks that look the same; at most
@@ -47,7 +47,7 @@ def ceilings_of(curriculum: Curriculum) -> Ceilings:
 
 
 def in_words(ceilings: Ceilings) -> list[tuple[str, str]]:
-    """Return names and values of ceilings for readers; what has no closed form is left out."""
+    """Return names and values of ceilings for readers, without those that have no closed form."""
     names = {
         "optimal": "optimum",
         "one_policy": "one policy for all tasks that look the same, at most",
@@ -84,8 +84,8 @@ def _is_plain(task: Task) -> bool:
 def _one_policy(tasks: Sequence[Task], protocol: Protocol) -> float | None:
     """Return the most that one policy without ids gets; None where ids are given or tasks do not pay alike.
 
-    Tasks with the same images and the same rules of what is shown are distinguished by nothing. A policy that reaches
-    the goal of the deepest one surely reaches those goals that are beginnings of it, and no mixture gets more.
+    Nothing distinguishes tasks with the same images and rules of what is shown. A policy that reaches the goal of the
+    deepest one surely reaches those that are beginnings of it, and no mixture gets more.
     """
     alike = len({task.goal_reward for task in tasks}) == 1 and all(map(_is_plain, tasks))
     if len(tasks) < 2 or protocol.task_id != "hidden" or not alike or tasks[0].goal_change is not None:
@@ -98,7 +98,7 @@ def _one_policy(tasks: Sequence[Task], protocol: Protocol) -> float | None:
 
 
 def _most_reached(goals: Iterable[tuple[int, ...]]) -> int:
-    """Return how many goals one sequence of decisions reaches at most."""
+    """Return the most goals that one sequence of decisions reaches."""
     counts = Counter(goals)
     return max(sum(n for goal, n in counts.items() if path[: len(goal)] == goal) for path in counts)
 
