@@ -8,6 +8,7 @@ from itertools import compress
 from pathlib import Path
 
 from ctgraph_rl.checks import positive, require
+from ctgraph_rl.core.goal import write_goal
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.draw.curriculum_figure import draw_graphs
 from ctgraph_rl.draw.similarity_figure import draw_similarity
@@ -223,7 +224,7 @@ def _block_rows(number: int, block: Block, labels: Mapping[TaskLike, str]) -> It
     for task in dict.fromkeys(ct_graphs(block.tasks, "this sheet")):
         graph = task.graph
         shape = (str(graph.branching_factor), str(graph.depth), f"{graph.wait_prob:g}")
-        yield name, labels[task], *shape, ".".join(map(str, task.goal)), frames, switch
+        yield name, labels[task], *shape, write_goal(task.goal), frames, switch
         name = frames = switch = ""
 
 

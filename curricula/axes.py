@@ -15,6 +15,7 @@ from math import prod
 from typing import Any
 
 from ctgraph_rl.checks import NamedValues, as_tuple, is_int, require, require_all, takes_numbers
+from ctgraph_rl.core.goal import Goal
 from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.tasks.configurations import OBSERVABILITY as OBSERVABILITY
 from ctgraph_rl.tasks.configurations import observations_of
@@ -58,16 +59,16 @@ def all_goals(tasks: OneOrMore) -> Tasks:
 
 
 @takes_numbers
-def given_goals(tasks: OneOrMore, goals: Iterable[Sequence[int]]) -> Tasks:
+def given_goals(tasks: OneOrMore, goals: Iterable[Goal]) -> Tasks:
     """Each task with each of the goals.
 
     Args:
         tasks: a task or several.
-        goals: decisions in 1..b, as many as the graph is deep.
+        goals: decisions in 1..b, as many as the graph is deep, such as ``["1.2", "2.1"]``.
     """
     listed = as_tuple(goals)
     if not isinstance(listed, tuple) or not listed:
-        raise ValueError(f"goals must be a list of goals such as [[1, 2], [2, 1]], got {goals!r}")
+        raise ValueError(f"goals must be a list of goals such as [1.2, 2.1], got {goals!r}")
     return each(tasks, lambda task: [replace(task, goal=goal) for goal in listed])
 
 
@@ -278,11 +279,11 @@ def observability(tasks: OneOrMore, kinds: Iterable[str], num_wait_images: int =
 
 
 @takes_numbers
-def reshaped(task: Task, graph: CTGraph, kind: str, goal: Sequence[int], num_wait_images: int = 100) -> Task:
+def reshaped(task: Task, graph: CTGraph, kind: str, goal: Goal, num_wait_images: int = 100) -> Task:
     """A task on another graph, observed in one of the ways of `observability`; all else stays."""
     observations = observations_of(graph, kind, num_wait_images)
     images = _with_room(task.images, observations.last_id + 1, exact=True)
-    return replace(task, graph=graph, goal=tuple(goal), observations=observations, images=images)
+    return replace(task, graph=graph, goal=goal, observations=observations, images=images)  # type: ignore[arg-type]
 
 
 # random graphs

@@ -12,6 +12,7 @@ from os import PathLike
 from typing import Any
 
 from ctgraph_rl.checks import ReadOnlyValues, are_ints, as_tuple, at_least_one, is_int, one_of, require, takes_its_kinds
+from ctgraph_rl.core.goal import Goal, read_goal
 from ctgraph_rl.core.rewards import REWARD_FNS
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import OneHot
@@ -54,7 +55,7 @@ def from_axes(
     depth: int | Sequence[int] | None = None,
     wait_prob: float | Sequence[float] | None = None,
     image_seeds: int | Sequence[int] = 1,
-    goals: str | Sequence[Sequence[int]] = "all",
+    goals: str | float | Sequence[Goal] = "all",
     num_goals: int = 4,
     order: str = "product",
     repeats: int = 1,
@@ -93,7 +94,7 @@ def from_axes(
         wait_prob: another p, or several; None: as configured [p].
         image_seeds: seed of the image set, or several [image set: seed].
         goals: ``all``; ``random``, ``num_goals`` a graph; ``nested``, a random path and its beginnings; or a list of
-            goals such as [[1,2],[2,1]], each for the graphs of its depth.
+            goals such as [1.2,2.1], each for the graphs of its depth.
         num_goals: how many random goals.
         order: ``product``; ``interleave``, image seeds take turns, or graphs if there is one seed; ``shuffle``, by
             ``seed``; or ``reverse``.
@@ -195,7 +196,7 @@ def from_axes(
 def from_graph(
     config: str | PathLike[str] | ReadOnlyValues | None = None,
     wait_prob: float | Sequence[float] | None = None,
-    goals: str | Sequence[Sequence[int]] = "all",
+    goals: str | float | Sequence[Goal] = "all",
     num_goals: int = 4,
     order: str = "product",
     repeats: int = 1,
@@ -212,7 +213,7 @@ def from_graph(
         config: the file, such as graph.json, which says all but the goal; or its content.
         wait_prob: another p, or several; None: as in the file.
         goals: ``all``; ``random``, ``num_goals`` of them; ``nested``, one random goal; or a list of goals such as
-            [[1,2],[2,1]].
+            [1.2,2.1].
         num_goals: how many random goals.
         order: ``product``, the goals of each wait probability; ``interleave``, wait probabilities take turns;
             ``shuffle``, by ``seed``; or ``reverse``.
@@ -268,20 +269,18 @@ def _shown(task: Task, ids: ReadOnlyValues) -> Observations:
     return shown_ids(task.graph, found)
 
 
-def _in_order(
-    by_seed: Sequence[Tasks], goals: str | Sequence[Sequence[int]], num_goals: int, order: str, seed: int
-) -> Tasks:
+def _in_order(by_seed: Sequence[Tasks], goals: Any, num_goals: int, order: str, seed: int) -> Tasks:
     """Return the graphs of each image seed with their goals, in one order."""
     require(*one_of(ORDERS, order=order), *at_least_one(num_goals=num_goals))
     depths = {graph.graph.depth for graph in by_seed[0]}
-    if isinstance(goals, str):
-        require((goals in GOALS, f"goals must be one of {', '.join(GOALS)}, or a list of goals, got {goals!r}"))
-    else:
-        listed = _several(goals)
-        is_list = all(isinstance(as_tuple(goal), tuple) for goal in listed)
-        require((is_list, f"goals must be one of {', '.join(GOALS)}, or a list such as [[1, 2]], got {goals!r}"))
-        rule = f"goals must have as many decisions as the depths, {sorted(depths)}, and some for each; got {goals!r}"
-        require(({len(goal) for goal in listed} == depths, rule))
+    given = goals
+    if not isinstance(goals, str) or goals not in GOALS:
+        goals = _several(goals)
+        read = [read_goal(goal) for goal in goals]
+        are_goals = all(isinstance(goal, tuple) for goal in read)
+        require((are_goals, f"goals must be one of {', '.join(GOALS)}, or a list such as [1.2,2.1], got {given!r}"))
+        rule = f"goals must have as many decisions as the depths, {sorted(depths)}, and some for each; got {given!r}"
+        require(({len(goal) for goal in read} == depths, rule))  # type: ignore[arg-type]
     with_goals = []
     for graphs in by_seed:
         with_goals.append([_with_goals(graph, goals, num_goals, seed) for graph in graphs])
@@ -294,12 +293,12 @@ def _in_order(
     return axes.reverse(tasks) if order == "reverse" else tasks
 
 
-def _with_goals(task: Task, goals: str | Sequence[Sequence[int]], num_goals: int, seed: int) -> Tasks:
+def _with_goals(task: Task, goals: str | tuple[Goal, ...], num_goals: int, seed: int) -> Tasks:
     if goals == "random":
         return axes.random_goals(task, num_goals, seed)
     if isinstance(goals, str):
         return axes.all_goals(task) if goals == "all" else axes.as_tasks(task)
-    return axes.given_goals(task, [goal for goal in goals if len(goal) == task.graph.depth])
+    return axes.given_goals(task, [goal for goal in goals if len(read_goal(goal)) == task.graph.depth])  # type: ignore[arg-type]
 
 
 def _curriculum(

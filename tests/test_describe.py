@@ -282,9 +282,9 @@ def test_goals_are_gathered_by_graph_with_their_blocks():
     goals = goals_by_graph(make(*blocks))
 
     assert goals == {
-        A.graph: {(1, 1): "11\nblocks 1, 2, 4", (1, 2): "12\n4 blocks"},
+        A.graph: {(1, 1): "1.1\nblocks 1, 2, 4", (1, 2): "1.2\n4 blocks"},
         wide.graph: {(11,): "11\nblock 3"},
-        deep.graph: {(1,) * 20: "1111111...1111111\nblock 5"},
+        deep.graph: {(1,) * 20: "1.1.1.1 ... 1.1.1.1\nblock 5"},
     }
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ctgraph_rl.core.graph import CTGraph
-from ctgraph_rl.draw.layout import MOST_PATHS, in_digits, lay_out
+from ctgraph_rl.draw.layout import MOST_PATHS, lay_out, write_short
 from ctgraph_rl.draw.style import (
     PlanePoint,
     draw_lines,
@@ -68,7 +68,7 @@ def goals_by_graph(curriculum: Curriculum) -> dict[CTGraph, dict[Goal, str]]:
     labels: dict[CTGraph, dict[Goal, str]] = {}
     for graph, goals in blocks.items():
         for goal, of_goal in goals.items():
-            labels.setdefault(graph, {})[goal] = f"{in_digits(goal)}\n{_write_blocks(sorted(set(of_goal)))}"
+            labels.setdefault(graph, {})[goal] = f"{write_short(goal)}\n{_write_blocks(sorted(set(of_goal)))}"
     return labels
 
 

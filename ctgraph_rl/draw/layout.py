@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from ctgraph_rl.core.goal import write_goal
 from ctgraph_rl.core.graph import WAIT_ACTION, CTGraph, StateType
 from ctgraph_rl.tasks.task import Task
 
@@ -27,8 +28,8 @@ MOST_PATHS = 8
 """End states drawn of a larger tree."""
 MOST_STUBS = 3
 """Stubs of left-out branches on each side of those drawn."""
-MOST_DIGITS = 14
-"""Characters up to which a path's decisions are written out."""
+MOST_DECISIONS = 8
+"""Decisions up to which a goal is written out."""
 
 
 class Edge(NamedTuple):
@@ -175,7 +176,9 @@ def write_ids(task: Task, state: Key, level: int) -> str:
     return str(first) if first == last else f"{first}-{last}"
 
 
-def in_digits(decisions: Sequence[int], sign: str = "") -> str:
-    """Return decisions as ``121``, or with a sign between them; a dot where one has two digits."""
-    text = (sign if max(decisions) < 10 else ".").join(map(str, decisions))
-    return text if len(text) <= MOST_DIGITS else f"{text[: MOST_DIGITS // 2]}...{text[-MOST_DIGITS // 2 :]}"
+def write_short(goal: Sequence[int]) -> str:
+    """Write a goal as ``1.2``, without its middle where it is long."""
+    if len(goal) <= MOST_DECISIONS:
+        return write_goal(goal)
+    end = MOST_DECISIONS // 2
+    return f"{write_goal(goal[:end])} ... {write_goal(goal[-end:])}"

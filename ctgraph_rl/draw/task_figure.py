@@ -19,9 +19,9 @@ from ctgraph_rl.draw.layout import (
     WAIT,
     Edge,
     Key,
-    in_digits,
     lay_out,
     write_ids,
+    write_short,
 )
 from ctgraph_rl.draw.style import PlanePoint, colour, draw_lines, goal_mark, mark, new_figure, shape_of, stub_lines
 from ctgraph_rl.tasks.task import Task
@@ -141,7 +141,7 @@ class _TaskPicture:
         if self.has_room:
             self._draw_loops()
             self._draw_ways_to_fail()
-        title = f"{shape_of(self.graph)}, goal {in_digits(self.task.goal, '.')}"
+        title = f"{shape_of(self.graph)}, goal {write_short(self.task.goal)}"
         if not self.layout.is_whole:
             waits = "" if self.waits else ", wait states left out"
             title += f"\n{len(self.layout.leaves)} of {self.graph.num_end_states:,} end states drawn{waits}"
@@ -241,7 +241,8 @@ class _TaskPicture:
         )
         for end in () if self.layout.is_whole else self.layout.leaves:
             under = 0, drop - 0.6 * size
-            self._note(in_digits(self.graph.path(end)), self.places[END, end], under, fontsize=6, ha="center", va="top")
+            path = write_short(self.graph.path(end))
+            self._note(path, self.places[END, end], under, fontsize=6, ha="center", va="top")
 
     def _draw_loops(self) -> None:
         if self.graph.wait_prob > 0:

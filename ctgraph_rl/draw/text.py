@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ctgraph_rl.core.dynamics import RowState
+from ctgraph_rl.core.goal import write_goal
 from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.tasks.task import Task
 
@@ -31,20 +32,16 @@ def as_text(tasks: Sequence[Task], state: RowState, observation: Tensor, white: 
 
 
 def _place(task: Task, kind: int, node: int, goal_leaf: int, step_count: int) -> str:
-    """Return a place by branches and swaps: ``wait state after 1 2, step 4, goal 1 1``."""
+    """Return a place by branches and swaps: ``wait state after 1.2, step 4, goal 1.1``."""
     graph = task.graph
-    goal = _write_path(graph.path(graph.num_decision_states + goal_leaf))
-    way = f" after {_write_path(graph.path(node))}" if node else ""
+    goal = write_goal(graph.path(graph.num_decision_states + goal_leaf))
+    way = f" after {write_goal(graph.path(node))}" if node else ""
     text = f"{StateType(kind).name.lower()} state{way}, step {step_count}, goal {goal}"
     if task.swapped_branches is None:
         return text
     path, (first, second) = task.swapped_branches
-    at = f"after {_write_path(path)}" if path else "at the first decision"
+    at = f"after {write_goal(path)}" if path else "at the first decision"
     return f"{text}, {first} and {second} swapped {at}"
-
-
-def _write_path(path: Sequence[int]) -> str:
-    return " ".join(map(str, path))
 
 
 def _blocks(observation: NDArray[np.uint8], white: int) -> str:

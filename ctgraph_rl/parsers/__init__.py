@@ -258,7 +258,7 @@ def _add_task(parser: ArgumentParser) -> None:
     _add(parser, "--task", "number of a curriculum's task, from 1", default=1, metavar="N", type=int)
     for name, kind in CHANGES.items():
         parser.add_argument(f"--{name.replace('_', '-')}", type=kind, metavar="N")
-    _add(parser, "--goal", "the decisions to the goal", metavar="1.2", type=decisions)
+    _add(parser, "--goal", "the decisions to the goal", metavar="1.2", type=str)
     parser.add_argument("--surjective", action="store_true", help="with numbers only: one image for each kind of state")
     who = parser.add_mutually_exclusive_group()
     who.add_argument("--policy", choices=POLICIES, help="who acts")
@@ -273,21 +273,6 @@ def existing(text: str) -> Path:
     if not path.exists():
         raise argparse.ArgumentTypeError(f"{text} holds no run: there is no such directory")
     return path
-
-
-class Decisions(tuple[int, ...]):
-    """A goal of the command line, which is written as there: 1.2."""
-
-    def __repr__(self) -> str:
-        return ".".join(map(str, self))
-
-
-def decisions(text: str) -> Decisions:
-    """Read ``1.2``, or ``1,2``, as a goal."""
-    parts = text.replace(",", ".").split(".")
-    if not all(part.isdecimal() for part in parts):
-        raise argparse.ArgumentTypeError(f"a goal is the decisions on the way to it, such as 1.2, got {text!r}")
-    return Decisions(map(int, parts))
 
 
 def _setting(text: str) -> tuple[str, Any]:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from ctgraph_rl import parsers
 from ctgraph_rl.checks import NamedValues, is_int, require
-from ctgraph_rl.draw.layout import in_digits
+from ctgraph_rl.draw.layout import write_short
 from ctgraph_rl.learn.collect import InitialState, Policy
 from ctgraph_rl.play.player import Player
 from ctgraph_rl.play.visits import Visits, visits
@@ -83,7 +83,7 @@ def _select_task(name: str | None, number: int, changes: NamedValues, config_dir
 
 
 def _name_task(name: str, task: Task) -> Selection:
-    return Selection(task, f"{name}, goal {in_digits(task.goal, '.')}")
+    return Selection(task, f"{name}, goal {write_short(task.goal)}")
 
 
 def _select_of_curriculum(curriculum: Curriculum, number: int) -> Selection:

@@ -13,6 +13,7 @@ from os import PathLike
 from typing import Any
 
 from ctgraph_rl.checks import NamedValues, did_you_mean, is_int, require, takes_numbers
+from ctgraph_rl.core.goal import Goal
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.tasks.images import OneHot, PaperImages
 from ctgraph_rl.tasks.observations import Observations
@@ -28,7 +29,7 @@ def ct_graph(
     branching_factor: int = 2,
     depth: int = 2,
     wait_prob: float = 0.0,
-    goal: tuple[int, ...] | None = None,
+    goal: Goal | None = None,
     fully_observable: bool = True,
     one_hot: bool = False,
     image_seed: int = 1,
@@ -39,7 +40,7 @@ def ct_graph(
         branching_factor: b >= 2.
         depth: d >= 1.
         wait_prob: p in [0, 1).
-        goal: d decisions in 1..b; None: always the first branch.
+        goal: d decisions in 1..b, such as ``"1.2"``; None: always the first branch.
         fully_observable: an image for each state, in the order home, fail, waits, decisions, ends; False: surjective,
             the images 0 to 4 for home, fail, decision, wait and end states.
         one_hot: vectors instead of images.
@@ -49,7 +50,7 @@ def ct_graph(
     observations = observations_of(graph, "full" if fully_observable else "surjective")
     num_images = observations.last_id + 1
     images = OneHot(num_images) if one_hot else PaperImages(num_images, image_seed)
-    return Task(graph, (1,) * depth if goal is None else goal, observations, images)
+    return Task(graph, (1,) * depth if goal is None else goal, observations, images)  # type: ignore[arg-type]
 
 
 @takes_numbers
@@ -75,62 +76,63 @@ def observations_of(graph: CTGraph, kind: str, num_wait_images: int = 100) -> Ob
     return shown_ids(graph, found)
 
 
-def ct_fo_b1(goal: tuple[int, ...] = (1, 1), image_seed: int = 1) -> Task:
+def ct_fo_b1(goal: Goal = "1.1", image_seed: int = 1) -> Task:
     """CT-FO-B1: fully observable, b=2, d=2, p=0; one of 16 images for each state.
 
     Args:
-        goal: two decisions in 1..2.
+        goal: two decisions in 1..2, such as ``"1.2"``.
         image_seed: seed of the image set.
     """
     return ct_graph(2, 2, 0.0, goal, image_seed=image_seed)
 
 
-def ct_fo_b2(goal: tuple[int, ...] = (1, 1, 1), image_seed: int = 1) -> Task:
+def ct_fo_b2(goal: Goal = "1.1.1", image_seed: int = 1) -> Task:
     """CT-FO-B2: fully observable, b=2, d=3, p=0.5; one of 32 images for each state.
 
     Args:
-        goal: three decisions in 1..2.
+        goal: three decisions in 1..2, such as ``"1.2.1"``.
         image_seed: seed of the image set.
     """
     return ct_graph(2, 3, 0.5, goal, image_seed=image_seed)
 
 
-def ct_su_b1(goal: tuple[int, ...] = (1, 1), image_seed: int = 1) -> Task:
+def ct_su_b1(goal: Goal = "1.1", image_seed: int = 1) -> Task:
     """CT-SU-B1: surjective, b=2, d=2, p=0; one image for all decision states, one for all wait states.
 
     The paper's D_IDs=[2,2] and W_IDs=[3,3].
 
     Args:
-        goal: two decisions in 1..2.
+        goal: two decisions in 1..2, such as ``"1.2"``.
         image_seed: seed of the image set.
 
     Example:
-        >>> ct_su_b1(goal=(2, 1)).memoryless_ceiling()
+        >>> ct_su_b1(goal="2.1").memoryless_ceiling()
         0.25
     """
     return ct_graph(2, 2, 0.0, goal, fully_observable=False, image_seed=image_seed)
 
 
-def ct_co_b1(goal: tuple[int, ...] = (1, 1), image_seed: int = 1) -> Task:
+def ct_co_b1(goal: Goal = "1.1", image_seed: int = 1) -> Task:
     """CT-CO-B1: confounding, b=2, d=2, p=0; wait states draw one of a hundred images at every observation.
 
     Decision states show image 2 and wait states the images 3 to 102: the paper's D_IDs=[2,2] and W_IDs=[3,102].
 
     Args:
-        goal: two decisions in 1..2.
+        goal: two decisions in 1..2, such as ``"1.2"``.
         image_seed: seed of the image set.
     """
     graph = CTGraph(2, 2, 0.0)
-    return Task(graph, goal, observations_of(graph, "confounding"), PaperImages(104, image_seed))
+    shown = observations_of(graph, "confounding")
+    return Task(graph, goal, shown, PaperImages(104, image_seed))  # type: ignore[arg-type]
 
 
-def ct_posr_b1(goal: tuple[int, ...] = (1, 1), image_seed: int = 1) -> Task:
+def ct_posr_b1(goal: Goal = "1.1", image_seed: int = 1) -> Task:
     """CT-POSR-B1: partially observable sparse reward, b=2, d=2, p=0.5; the images of CT-SU-B1.
 
     The paper's D_IDs=[2,2] and W_IDs=[3,3]. Episodes have a variable length, and rewards have no noise.
 
     Args:
-        goal: two decisions in 1..2.
+        goal: two decisions in 1..2, such as ``"1.2"``.
         image_seed: seed of the image set.
     """
     return ct_graph(2, 2, 0.5, goal, fully_observable=False, image_seed=image_seed)
@@ -170,7 +172,7 @@ def make_task(task: Task | str | None = None, config: Json | None = None, **chan
         ValueError: for unknown names, and values out of range.
 
     Example:
-        >>> make_task("CT-FO-B2", goal=(1, 2, 1)).graph.depth
+        >>> make_task("CT-FO-B2", goal="1.2.1").graph.depth
         3
     """
     require((task is None or config is None, "give a task or a config, not both"))

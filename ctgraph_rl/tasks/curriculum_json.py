@@ -3,8 +3,9 @@
 Every field is written out, defaults too, under the names that the classes have. The different tasks are listed once,
 first those that blocks train, then those held out; blocks and ``held_out`` name them by position, from 0. ``type`` says
 which of several classes a part is. ``fingerprint`` is that of `Curriculum`; ``about`` holds numbers that follow from
-the rest and is not read. A field that was added later, ``field(default=..., metadata={"added": True})`` with a default
-that means "as before", may be missing: older files have none.
+the rest and is not read. A goal is a text, ``"1.2"``. A field
+that was added later, ``field(default=..., metadata={"added": True})`` with a default that means "as before", may be
+missing: older files have none.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from ctgraph_rl import __version__
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, are_ints, by_name, is_int, require
+from ctgraph_rl.core.goal import write_goal
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import REWARD_FNS
 from ctgraph_rl.disk import write_whole
@@ -94,7 +96,10 @@ def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = 
     for task in places:
         kind = type(task)
         named = {} if kind is Task else {"type": type_name(kind)}
-        listed.append(named | {name: _plain(getattr(task, name), {}) for name in _names(kind)})
+        values = {name: _plain(getattr(task, name), {}) for name in _names(kind)}
+        if isinstance(task, Task):
+            values["goal"] = write_goal(task.goal)
+        listed.append(named | values)
     content: NamedValues = {
         "schema": SCHEMA,
         "fingerprint": curriculum.fingerprint,

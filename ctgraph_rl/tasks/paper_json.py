@@ -13,6 +13,7 @@ from difflib import get_close_matches
 from typing import Any
 
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, as_tuple, is_int, require
+from ctgraph_rl.core.goal import Goal
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.tasks.images import OneHot, PaperImages
 from ctgraph_rl.tasks.observations import Observations
@@ -58,7 +59,7 @@ def is_paper_json(content: ReadOnlyValues) -> bool:
     return "image_dataset" not in content and isinstance(shape, Mapping) and bool({"d", "b"} & shape.keys())
 
 
-def read_paper_json(source: str, content: ReadOnlyValues, goal: Sequence[int] | None) -> NamedValues:
+def read_paper_json(source: str, content: ReadOnlyValues, goal: Goal | None) -> NamedValues:
     """Return the arguments of `Task` for the parameters of Table 3.
 
     Ids that are left out are the next free ones after those of the home state, 0, and the fail state, 1: decision
@@ -67,14 +68,14 @@ def read_paper_json(source: str, content: ReadOnlyValues, goal: Sequence[int] | 
     Args:
         source: the file, for messages.
         content: its content.
-        goal: d decisions in 1..b.
+        goal: d decisions in 1..b, such as ``"1.2"``.
 
     Raises:
         ValueError: for a missing goal, unknown sections and keys, and a graph without d or b.
     """
     found = dict(_found(source, content))
     require(
-        (goal is not None, "goal is not in Table 3 and must be given: d decisions in 1..b, such as goal=(1, 2)"),
+        (goal is not None, "goal is not in Table 3 and must be given: d decisions in 1..b, such as 1.2"),
         *((SHAPE[key] in found, f"{source}: graph_shape.{key} is missing") for key in ("d", "b")),
     )
     found = DEFAULTS | found

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from itertools import product
 from os import PathLike
 from os.path import lexists
 from typing import TYPE_CHECKING
 
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule, is_int, is_real, require
+from ctgraph_rl.core.goal import Goal
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import Needle, ReferenceLinear, RewardFn
 from ctgraph_rl.disk import write_whole
@@ -70,13 +71,13 @@ _LEGACY: NamedValues = {"reward_cue": True, "cue_wraps": True, "legacy_index": T
 """How the authors' implementation shows states, whatever a file says."""
 
 
-def read_task(path_or_dict: str | PathLike[str] | ReadOnlyValues, goal: Sequence[int] | None) -> NamedValues:
+def read_task(path_or_dict: str | PathLike[str] | ReadOnlyValues, goal: Goal | None) -> NamedValues:
     """Return the arguments of `Task` for a configuration file or its content."""
     source, content = json_object(path_or_dict, "configuration", MAX_BYTES)
     if is_paper_json(content):
         return read_paper_json(source, content, goal)
     draws = "the authors' implementation draws one at random or sets it with set_high_reward_path, counting from 0"
-    fix = "add 1 to each entry of its path, such as goal=(1, 2) for [0, 1]"
+    fix = "add 1 to each entry of its path, such as the goal 1.2 for [0, 1]"
     require((goal is not None, f"goal is not in the file and must be given: {draws}; {fix}"))
     given = set(_given(content))
     dialect = max(

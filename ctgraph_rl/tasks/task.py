@@ -22,9 +22,9 @@ from ctgraph_rl.checks import (
     takes_numbers,
     true_or_false,
 )
+from ctgraph_rl.core.goal import Goal, read_goal, write_goal
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import Needle, RewardFn
-from ctgraph_rl.parsers import Decisions
 from ctgraph_rl.tasks import reference, values
 from ctgraph_rl.tasks.images import ImageSet, has_cue_element
 from ctgraph_rl.tasks.kinds.registry import environment
@@ -46,12 +46,12 @@ LARGEST_REWARD = 1e30
 class Task:
     """One CT-graph problem. Frozen, validated, equal and hashable by value.
 
-    ``dataclasses.replace(task, goal=(2, 1))`` gives a variation.
+    ``dataclasses.replace(task, goal="2.1")`` gives a variation.
 
     Args:
         graph: shape of the tree, <b, d, p>.
-        goal: the branches that lead to the goal, d integers in 1..b; they are the decisions to take, but for
-            ``swapped_branches``.
+        goal: the branches that lead to the goal, d integers in 1..b, as ``"1.2"`` or (1, 2); afterwards a tuple. They
+            are the decisions to take, but for ``swapped_branches``.
         observations: which id each state shows, X.
         images: what is behind the ids, O.
         reward_fn: the share of ``goal_reward`` that each end state pays, g.
@@ -77,10 +77,10 @@ class Task:
         >>> from dataclasses import replace
         >>> from ctgraph_rl import PaperImages
         >>> x = Observations(wait_ids=(2, 2), decision_ids=(3, 3), end_ids=(4, 4))
-        >>> task = Task(CTGraph(2, 2), goal=(1, 2), observations=x, images=PaperImages(5))
+        >>> task = Task(CTGraph(2, 2), goal="1.2", observations=x, images=PaperImages(5))
         >>> task.optimal_value(1.0)
         1.0
-        >>> replace(task, goal=(2, 2)).goal
+        >>> replace(task, goal="2.2").goal
         (2, 2)
     """
 
@@ -106,11 +106,13 @@ class Task:
         """Return graph, goal and images, in one line."""
         graph = self.graph
         shape = f"b={graph.branching_factor}, d={graph.depth}, p={graph.wait_prob:g}"
-        return f"<Task {shape}, goal {'.'.join(map(str, self.goal)):.40}, {self.images!r:.80}>"
+        return f"<Task {shape}, goal {write_goal(self.goal):.40}, {self.images!r:.80}>"
 
     def __post_init__(self) -> None:
         make_fields_plain(self)
         self._check_parts()
+        given = self.goal
+        object.__setattr__(self, "goal", read_goal(given))
         if isinstance(self.swapped_branches, tuple):
             object.__setattr__(self, "swapped_branches", tuple(map(as_tuple, self.swapped_branches)))
         one_hot = len(self.images.shape) == 1
@@ -120,7 +122,7 @@ class Task:
         last_id = x.last_id
         too_few = f"num_images={room} is too few for id {last_id} in observations: needs at least {last_id + 1}"
         require(
-            self._goal_rule(),
+            self._goal_rule(given),
             self._swap_rule(),
             *self.observations.rules(self.graph),
             (last_id < room, too_few),
@@ -134,9 +136,7 @@ class Task:
             object.__setattr__(self, name, float(getattr(self, name)))
 
     @classmethod
-    def from_json(
-        cls, path_or_dict: str | PathLike[str] | Mapping[str, Any], goal: Sequence[int] | None = None
-    ) -> Self:
+    def from_json(cls, path_or_dict: str | PathLike[str] | Mapping[str, Any], goal: Goal | None = None) -> Self:
         """The task of a configuration file: of the paper's Table 3, or of the authors' implementation.
 
         The parameters of Table 3 have the paper's meaning; see `ctgraph_rl.tasks.paper_json`. A file with a section
@@ -147,7 +147,8 @@ class Task:
 
         Args:
             path_or_dict: the file, or its content.
-            goal: d decisions in 1..b; the file has none. A path for ``set_high_reward_path`` counts from 0: add 1.
+            goal: d decisions in 1..b, such as ``"1.2"``; the file has none. A path for
+                ``set_high_reward_path`` counts from 0: add 1.
 
         Raises:
             ValueError: for a missing goal, a file that cannot be read, keys that are missing, unknown or of several
@@ -159,7 +160,7 @@ class Task:
     def to_json(self, path: str | PathLike[str] | None = None, general_seed: int = 1) -> dict[str, Any]:
         """This task as a configuration file of the authors' implementation, with the keys of 2023.
 
-        The file has no goal: call ``set_high_reward_path`` there with the decisions less 1, [1, 0] for ``goal=(2, 1)``.
+        The file has no goal: call ``set_high_reward_path`` there with the decisions less 1, [1, 0] for the goal 2.1.
         ``Task.from_json(task.to_json(), goal=task.goal)`` equals every task that `from_json` made.
 
         Args:
@@ -214,15 +215,18 @@ class Task:
             return True
         return abs(self.goal_reward * self.reward_std) <= LARGEST_REWARD
 
-    def _goal_rule(self) -> Rule:
+    def _goal_rule(self, given: object) -> Rule:
         b = self.graph.branching_factor
         d = self.graph.depth
         goal = self.goal
-        holds = isinstance(goal, tuple) and len(goal) == d and are_ints(goal, 1, b)
-        written = Decisions if isinstance(goal, Decisions) else tuple
-        message = f"goal must be {d} decisions in 1..{b}, such as {written((1,) * d)}, got {goal!r}"
-        if not holds and isinstance(goal, tuple) and 0 in goal and are_ints(goal, 0, b - 1):
-            decisions = written(branch + 1 for branch in goal)
+        may_be_another = isinstance(given, float) and b > 9
+        holds = isinstance(goal, tuple) and len(goal) == d and are_ints(goal, 1, b) and not may_be_another
+        got = given if isinstance(given, str) and given and given.isprintable() else repr(given)
+        message = f"goal must be {d} decisions in 1..{b}, such as {write_goal((1,) * d)}, got {got}"
+        if may_be_another:
+            message += """, a number, and as numbers 1.1 and 1.10 are equal: put it in quotes, in a shell '"1.10"'"""
+        elif not holds and isinstance(goal, tuple) and 0 in goal and are_ints(goal, 0, b - 1):
+            decisions = write_goal(branch + 1 for branch in goal)
             message += f"; a path of the authors' implementation counts from 0: use {decisions}"
         return holds, message
 
@@ -322,10 +326,10 @@ class Task:
         images = type(self.images).__name__.lower() if self.image_seed is None else f"img{self.image_seed}"
         swap = "noswap"
         if self.swapped_branches is not None:
-            path, pair = (".".join(map(str, part)) for part in self.swapped_branches)
+            path, pair = map(write_goal, self.swapped_branches)
             swap = f"swap{pair}" + (f"at{path}" if path else "")
         return {
-            "goal": f"goal{'.'.join(map(str, self.goal))}",
+            "goal": f"goal{write_goal(self.goal)}",
             "depth": f"d{self.graph.depth}",
             "branching_factor": f"b{self.graph.branching_factor}",
             "wait_prob": f"p{self.graph.wait_prob:g}",

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
-
 import pytest
 from helpers.sweeping import command_line, configs, sweep
 
-from ctgraph_rl.parsers import decisions
 from ctgraph_rl.runs.settings import as_typed, in_digits
 
 
@@ -125,16 +122,3 @@ SETTINGS = {
 )
 def test_a_message_names_settings_as_they_are_typed(message, typed, said):
     assert as_typed(message, SETTINGS, typed) == said
-
-
-@pytest.mark.parametrize("text", ["1.2", "1,2"])
-def test_a_goal_is_written_with_points_or_commas(text):
-    assert decisions(text) == (1, 2)
-
-
-@pytest.mark.parametrize("text", ["", "a", "1..2", "-1"])
-def test_what_is_no_goal_is_refused_with_an_example(text):
-    with pytest.raises(
-        argparse.ArgumentTypeError, match=r"a goal is the decisions on the way to it, such as 1\.2, got"
-    ):
-        decisions(text)

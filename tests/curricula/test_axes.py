@@ -194,7 +194,7 @@ def test_branching_factors_share_the_ids_of_the_widest_graph():
     assert {(task.goal, task.observations) for task in tasks} == {((2, 1), widest.observations)}
     with pytest.raises(ValueError, match=r"factors must be in 2..4, the task's own, got \[5\]; give a wider task"):
         branching_factors(widest, [5])
-    with pytest.raises(ValueError, match=r"goal must be 2 decisions in 1..2, such as \(1, 1\), got \(4, 1\)"):
+    with pytest.raises(ValueError, match=r"goal must be 2 decisions in 1..2, such as 1\.1, got \(4, 1\)"):
         branching_factors(replace(widest, goal=(4, 1)), [2])
 
 
@@ -316,8 +316,8 @@ def test_a_shuffle_is_a_permutation_that_the_seed_decides():
         (lambda: all_goals("su_b1"), "tasks must be a list with at least one Task, got str"),
         (lambda: all_goals(()), "tasks must be a list with at least one Task, got none"),
         (lambda: all_goals(ct_graph(2, 17)), "131072 tasks are too many: at most 100000; use random_goals"),
-        (lambda: given_goals(SU, [(1, 1, 1)]), r"goal must be 2 decisions in 1..2, such as \(1, 1\), got \(1, 1, 1\)"),
-        (lambda: given_goals(SU, "all"), r"goals must be a list of goals such as \[\[1, 2\], \[2, 1\]\], got 'all'"),
+        (lambda: given_goals(SU, [(1, 1, 1)]), r"goal must be 2 decisions in 1..2, such as 1\.1, got \(1, 1, 1\)"),
+        (lambda: given_goals(SU, "all"), r"goals must be a list of goals such as \[1\.2, 2\.1\], got 'all'"),
         (lambda: given_goals(SU, []), r"goals must be a list of goals such as .*, got \[\]"),
         (lambda: goals_sharing(SU, 3), r"num_decisions must be in 0..2, the depth, got 3"),
         (lambda: random_goals(SU, 5, 0), r"num_goals must be in 1..4, as many as differ, got 5"),

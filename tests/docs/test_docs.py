@@ -84,12 +84,12 @@ REFUSED = [
     (
         lambda: read(goal=None),
         "goal is not in the file and must be given: the authors' implementation draws one at random or sets it with "
-        "set_high_reward_path, counting from 0; add 1 to each entry of its path, such as goal=(1, 2) for [0, 1]",
+        "set_high_reward_path, counting from 0; add 1 to each entry of its path, such as the goal 1.2 for [0, 1]",
     ),
     (
         lambda: read(goal=(0, 1)),
-        "goal must be 2 decisions in 1..2, such as (1, 1), got (0, 1); "
-        "a path of the authors' implementation counts from 0: use (1, 2)",
+        "goal must be 2 decisions in 1..2, such as 1.1, got (0, 1); "
+        "a path of the authors' implementation counts from 0: use 1.2",
     ),
     (
         lambda: read(reward__min_static_reward_episodes=5, reward__max_static_reward_episodes=5),

@@ -8,7 +8,7 @@ import torch
 
 from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.draw.dot import to_dot
-from ctgraph_rl.draw.layout import Edge, in_digits, lay_out, shown_ids, write_ids
+from ctgraph_rl.draw.layout import Edge, lay_out, shown_ids, write_ids, write_short
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS, ct_fo_b1, ct_fo_b2, make_task
 
@@ -53,17 +53,16 @@ def test_the_time_to_lay_out_does_not_grow_with_the_tree():
 
 
 @pytest.mark.parametrize(
-    ("way", "sign", "text"),
+    ("goal", "text"),
     [
-        ((1, 2), "", "12"),
-        ((1, 2), ".", "1.2"),
-        ((11, 2), "", "11.2"),
-        ((1,) * 14, "", "1" * 14),
-        ((1,) * 15, "", "1111111...1111111"),
+        ((1, 2), "1.2"),
+        ((11, 2), "11.2"),
+        ((1, 2) * 4, "1.2.1.2.1.2.1.2"),
+        ((1, 2, 3, 4, 5, 6, 7, 8, 9), "1.2.3.4 ... 6.7.8.9"),
     ],
 )
-def test_decisions_are_written_short(way, sign, text):
-    assert in_digits(way, sign) == text
+def test_a_long_goal_is_written_without_its_middle(goal, text):
+    assert write_short(goal) == text
 
 
 def test_every_state_and_transition_of_a_graph_is_there():

@@ -160,11 +160,11 @@ def test_ansi_says_where_the_row_is_and_shows_its_image():
         texts.append(env.render())
 
     assert texts == [
-        "home state, step 0, goal 1 2\n██        ",
-        "wait state, step 1, goal 1 2\n    ██    ",
-        "decision state, step 2, goal 1 2\n      ██  ",
-        "wait state after 2, step 3, goal 1 2\n    ██    ",
-        "fail state after 2, step 4, goal 1 2\n  ██      ",
+        "home state, step 0, goal 1.2\n██        ",
+        "wait state, step 1, goal 1.2\n    ██    ",
+        "decision state, step 2, goal 1.2\n      ██  ",
+        "wait state after 2, step 3, goal 1.2\n    ██    ",
+        "fail state after 2, step 4, goal 1.2\n  ██      ",
     ]
 
 
@@ -290,5 +290,5 @@ def test_a_wrong_keyword_is_answered_with_the_nearest_one():
 
 
 def test_a_path_that_counts_from_zero_is_answered_with_the_goal():
-    with pytest.raises(ValueError, match=r"counts from 0: use \(1, 2\)"):
+    with pytest.raises(ValueError, match=r"counts from 0: use 1\.2"):
         ct_su_b1(goal=(0, 1))

@@ -33,7 +33,7 @@ def test_the_last_leaf_of_the_deepest_tree_is_exact():
 
 @pytest.mark.parametrize("goal", [(), (1,), (1, 1, 1), (0, 1), (1, 3), (-1, 1), (1, 1.0), (True, 1), "11", 11, None])
 def test_a_goal_that_is_not_d_decisions_in_one_to_b_is_refused(goal):
-    with pytest.raises(ValueError, match=r"goal must be 2 decisions in 1\.\.2, such as \(1, 1\), got"):
+    with pytest.raises(ValueError, match=r"goal must be 2 decisions in 1\.\.2, such as 1\.1, got"):
         Task(CTGraph(2, 2), goal, X, PaperImages(5))
 
 

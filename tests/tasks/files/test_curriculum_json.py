@@ -97,7 +97,7 @@ def test_tasks_are_listed_once_and_named_by_position(content):
 def test_every_field_is_written_with_its_default_too(content):
     assert content["tasks"][0] == {
         "graph": {"branching_factor": 2, "depth": 2, "wait_prob": 0.0},
-        "goal": [1, 1],
+        "goal": "1.1",
         "observations": {
             **{"wait_ids": [2, 2], "decision_ids": [3, 3], "end_ids": [4, 4], "home_ids": [0, 0], "fail_ids": [1, 1]},
             **{"unique_waits": False, "unique_decisions": False, "unique_ends": False},

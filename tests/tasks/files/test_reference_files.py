@@ -156,7 +156,7 @@ def test_a_file_without_a_goal_is_refused_with_what_the_goal_is_there():
 
 
 def test_a_path_counted_from_0_is_refused():
-    with pytest.raises(ValueError, match=r"goal must be 2 decisions in 1\.\.2, such as \(1, 1\), got \(0, 1\)"):
+    with pytest.raises(ValueError, match=r"goal must be 2 decisions in 1\.\.2, such as 1\.1, got \(0, 1\)"):
         Task.from_json(SHIPPED_2023, goal=(0, 1))
 
 
