@@ -29,8 +29,6 @@ MOST_LEVEL = 4
 """End states up to which labels stand level."""
 COLUMNS = 3
 
-Goal = tuple[int, ...]
-
 
 def draw_graphs(curriculum: Curriculum, path: Path | str) -> None:
     """Draw the graphs and goals of a curriculum.
@@ -59,13 +57,13 @@ def draw_graphs(curriculum: Curriculum, path: Path | str) -> None:
     save_figure(figure, path)
 
 
-def goals_by_graph(curriculum: Curriculum) -> dict[CTGraph, dict[Goal, str]]:
+def goals_by_graph(curriculum: Curriculum) -> dict[CTGraph, dict[tuple[int, ...], str]]:
     """Return each graph's goals, labelled with decisions and the blocks that train them."""
-    blocks: dict[CTGraph, dict[Goal, list[int]]] = {}
+    blocks: dict[CTGraph, dict[tuple[int, ...], list[int]]] = {}
     for number, block in enumerate(curriculum.blocks, 1):
         for task in dict.fromkeys(ct_graphs(block.tasks, "a figure of graphs")):
             blocks.setdefault(task.graph, {}).setdefault(task.goal, []).append(number)
-    labels: dict[CTGraph, dict[Goal, str]] = {}
+    labels: dict[CTGraph, dict[tuple[int, ...], str]] = {}
     for graph, goals in blocks.items():
         for goal, of_goal in goals.items():
             labels.setdefault(graph, {})[goal] = f"{write_short(goal)}\n{_write_blocks(sorted(set(of_goal)))}"
@@ -78,7 +76,7 @@ def _write_blocks(numbers: Sequence[int]) -> str:
     return f"blocks {', '.join(map(str, numbers))}" if len(numbers) <= 3 else f"{len(numbers)} blocks"
 
 
-def _draw_panel(axes: Any, graph: CTGraph, goals: Mapping[Goal, str]) -> None:
+def _draw_panel(axes: Any, graph: CTGraph, goals: Mapping[tuple[int, ...], str]) -> None:
     labels = {graph.node_at(goal): label for goal, label in goals.items()}
     layout = lay_out(graph, list(labels)[:MOST_PATHS])
     shown = [end for end in layout.leaves if end in labels]
