@@ -39,7 +39,7 @@ def why_not_together(agent: Agent) -> str | None:
     """Return why agents like this one cannot act and learn as one batch; None if they can."""
     learner = learner_of(agent)
     name = type(learner).__name__
-    if not isinstance(learner, Learner) or not learner.stackable or learner.memory:
+    if not isinstance(learner, Learner) or not learner.stackable:
         return f"{name} cannot be vectorised over seeds"
     if not has_stackable(learner, ("learn", "gradient_step")):
         return f"{name} does not learn by the steps that a batch of seeds shares"
@@ -140,11 +140,21 @@ class SeedGroup:
 
     def acted(self, data: TensorDictBase) -> Items:
         """Return what the policies write, [seeds, num_envs, ...] each."""
+        keys = [key for key in self.first.policy.in_keys if key in data.keys()]  # noqa: SIM118, rows otherwise
+        if self.first.memory:
+            return self._acted_in_turn({key: self.by_seed(data[key]) for key in keys})
         if self._acting is None:
             self._acting = Stack(self.learners)
-        keys = [key for key in self.first.policy.in_keys if key in data.keys()]  # noqa: SIM118, rows otherwise
         outputs = self._act(self._acting, {key: self.by_seed(data[key]) for key in keys})
         return self._explored(outputs) if "action_value" in outputs else self._sampled(outputs)
+
+    def _acted_in_turn(self, data: Items) -> Items:
+        """Return what the policies write, each computed as that of a single agent: over its histories."""
+        written = []
+        for number, learner in enumerate(self.learners):
+            with self.random(number):
+                written.append(learner.policy.act_on_tensors({key: value[number] for key, value in data.items()}))
+        return {key: torch.stack([each[key] for each in written]) for key in written[0]}
 
     def _act(self, stack: Stack, data: Items) -> TensorsByName:
         """Compute `Stack.outputs` by a graph of its operations, compiled where the agents set it.
@@ -285,7 +295,8 @@ def _gains_from_stacking(learner: Learner) -> bool:
     """
     method = type(learner.method)
     plain = method.penalties is Hooks.penalties and method.transform_gradients is Hooks.transform_gradients
-    return learner.minibatch_size <= LARGEST_MINIBATCH and (plain or learner.compiled_step is None)
+    small = learner.minibatch_size <= LARGEST_MINIBATCH and not learner.memory
+    return small and (plain or learner.compiled_step is None)
 
 
 def _most_at_once(learner: Learner) -> int:

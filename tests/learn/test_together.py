@@ -14,7 +14,7 @@ import pytest
 import torch
 from helpers.kill_runs import equal
 from helpers.scripted import ONE, THREE, TWO, ScriptedGroup, Told, decide, first_training, lines, of
-from helpers.small_agents import BATCHED, TINY, others_slow, saved_and_loaded
+from helpers.small_agents import BATCHED, MINIBATCHES, TINY, others_slow, saved_and_loaded
 
 from baselines.methods.l2 import L2
 from baselines.methods.method import Method
@@ -77,10 +77,10 @@ class Together(NamedTuple):
 
 @pytest.fixture
 def make(compose):
-    """Makes a `Together` of an agent's name in `BATCHED`, a method and more settings."""
+    """Makes a `Together` of an agent's name in `BATCHED` or with memory, a method and more settings."""
 
     def make(name: str = "a2c", method: str = "finetune", *overrides: str, curriculum=CURRICULUM) -> Together:
-        settings = [*TINY, *BATCHED[name], *overrides]
+        settings = [*TINY, *BATCHED.get(name, MINIBATCHES), *overrides]
         cfg = compose(f"agent={name.removeprefix('prioritized ')}", f"method={method}", *settings)
         make_agent = with_method(target(cfg, "agent"), target(cfg, "method"), curriculum)
         return Together(make_agent, curriculum)
@@ -332,6 +332,18 @@ def test_large_minibatches_and_compiled_methods_are_learned_one_seed_after_the_o
         assert agent.state_dict().keys() == alone.state_dict().keys()
 
 
+@pytest.mark.parametrize("method", others_slow(["finetune", "ewc", "mask_lc", "clear"], "finetune"))
+def test_seeds_with_memory_have_the_bits_of_runs_alone(make, method):
+    its = make("lstm_ppo", method)
+
+    group, logs = its.learn(SEEDS[:2])
+
+    for seed, agent, log in zip(SEEDS[:2], group.agents, logs, strict=True):
+        alone, its_log = its.alone(seed)
+        assert lines(log) == lines(its_log)
+        assert equal(saved_and_loaded(agent.state_dict()), saved_and_loaded(alone.state_dict()))
+
+
 @pytest.mark.parametrize(("name", "method"), others_slow(SOME[::3], ("prioritized dqn", "finetune")))
 def test_another_seed_beside_it_changes_no_bit_of_a_seed(make, name, method):
     its = make(name, method, curriculum=ONE_BATCH_EACH)
@@ -436,14 +448,14 @@ def test_what_cannot_be_one_batch_says_why(compose):
         make_agent = with_method(target(cfg, "agent"), target(cfg, "method"), CURRICULUM)
         return together.why_not_together(new_agent(CURRICULUM, make_agent, 0))
 
-    assert reason("lstm_ppo", "finetune") == "LSTMPPO cannot be vectorised over seeds"
+    assert reason("drqn", "finetune") == "DRQN cannot be vectorised over seeds"
     agent = new_agent(CURRICULUM, with_method(target(compose("agent=ppo", *TINY), "agent"), Doubled, CURRICULUM), 0)
     assert (
         together.why_not_together(agent)
         == "Doubled cannot be vectorised over seeds: its hooks take the weights of one seed"
     )
     assert str(reason("ppo", "mask_amsc")).startswith("MaskAMSC cannot be vectorised over seeds: ")
-    assert reason("dqn") is reason("ppo", "mask_lc") is reason("ppo", "packnet") is None
+    assert reason("lstm_ppo") is reason("dqn") is reason("ppo", "mask_lc") is reason("ppo", "packnet") is None
     switching = of(Block((ONE, TWO), 96, ByEpisode(2, together=True)), boundaries="hidden")
     assert why_not_together(switching) == "its blocks change the tasks of all rows at once"
     assert why_not_together(CURRICULUM) is None
