@@ -36,9 +36,8 @@ class Learner(TakesNumbers, Trained):
     """Whether earlier steps of an episode can change the action."""
 
     stackable: ClassVar[bool] = False
-    """Whether `loss` and `outputs` can be vectorised over seeds, see `baselines.update.seeds`; with ``memory``, whether seeds can
-    act and learn in turn. A
-    subclass that overrides what seeds share, such as `learn`, must set it again."""
+    """Whether `loss` and `outputs` can be vectorised over seeds, see `baselines.update.seeds`; with ``memory``, whether
+    seeds can take turns. A subclass that overrides what seeds share, such as `learn`, must set it again."""
 
     solves: ClassVar[str]
     """Which tasks it can solve in principle, in a few words."""
