@@ -14,7 +14,7 @@ from typing_extensions import override
 from ctgraph_rl.batch.assignment import one_hot_ids, require_num_ids
 from ctgraph_rl.batch.native import Stepped
 from ctgraph_rl.batch.rows import Rows
-from ctgraph_rl.batch.specs import done_spec, make_specs, reward_spec
+from ctgraph_rl.batch.specs import TASK_NUMBER, done_spec, make_specs, reward_spec
 from ctgraph_rl.checks import require, require_all, takes_numbers, true_or_false
 from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.device import checked_device
@@ -112,7 +112,7 @@ class CTGraphEnv(EnvBase):
         ids = {} if task_ids is None else task_ids
         numbers = torch.tensor([ids.get(task, -1) for task in self.rows.pool], device=self.device, dtype=torch.int64)
         self.register_buffer("_id_of_task", numbers, persistent=False)
-        self._task_id: tuple[Tensor | None, Tensor] = None, numbers
+        self._task_id: tuple[Tensor | None, RowData] = None, {}
         self._steps: list[TensorDictBase] | None = None
         self._running: RowData = {}
         specs = make_specs(self.rows.pool, self.batch_size, self.num_task_ids, self.info)
@@ -356,14 +356,14 @@ class CTGraphEnv(EnvBase):
     def _counts(self, counts: Rows | Stepped) -> RowData:
         keys = ("step_count", "episode_reward") if self.info else ()
         data = {key: getattr(counts, key).unsqueeze(-1) for key in keys}
-        return data | {"task_id": self._show_ids()} if self.num_task_ids else data
+        return data | self._show_ids() if self.num_task_ids else data
 
-    def _show_ids(self) -> Tensor:
-        """Return the rows' task ids as one-hot, uint8 [N, num_task_ids]; zeros for tasks without one."""
+    def _show_ids(self) -> RowData:
+        """Return the rows' task ids, one-hot, uint8 [N, num_task_ids], and as numbers; made where tasks have changed."""
         task, shown = self._task_id
         if task is not self.rows.task:
             ids = self._id_of_task.index_select(0, self.rows.task)
-            shown = one_hot_ids(ids, self.num_task_ids)
+            shown = {"task_id": one_hot_ids(ids, self.num_task_ids), TASK_NUMBER: ids.unsqueeze(-1)}
             self._task_id = self.rows.task, shown
         return shown
 
@@ -393,7 +393,7 @@ class CTGraphEnv(EnvBase):
         self.rows.set_seed(seed)  # type: ignore[arg-type]
 
 
-_SHARED = ("terminated", "step_count", "episode_reward", "reward", "task_id")
+_SHARED = ("terminated", "step_count", "episode_reward", "reward", "task_id", TASK_NUMBER)
 """Data of rows whose memory is also that of other data or of the rows."""
 
 

@@ -16,6 +16,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import ProbabilisticActor, ValueOperator, recurrent_mode
 
 from baselines.cells.cell import REWARD, Cell, CellState, MakeCell, linear_layer, reset
+from ctgraph_rl.batch.specs import TASK_NUMBER
 from ctgraph_rl.checks import one_of, require, require_memory
 from ctgraph_rl.learn import histories
 from ctgraph_rl.learn.collect import PREVIOUS_ACTION, UNSTORED
@@ -89,7 +90,8 @@ class Encoder(nn.Module):
         high: largest value of an observation.
         num_features: width of every layer.
         num_layers: linear layers, at least 1.
-        num_extra: width of further inputs, such as a one-hot task id.
+        num_extra: width of further inputs.
+        num_ids: number of task ids, of which a number is read as a one-hot vector would be; 0: none is read.
         kind: ``mlp``, or ``cnn`` with `Convolutions` before the linear layers.
     """
 
@@ -100,6 +102,7 @@ class Encoder(nn.Module):
         num_features: int,
         num_layers: int = 1,
         num_extra: int = 0,
+        num_ids: int = 0,
         kind: str = "mlp",
     ) -> None:
         super().__init__()
@@ -108,19 +111,39 @@ class Encoder(nn.Module):
         self.scale = 1 / high
         self.convolutions = Convolutions(shape) if kind == "cnn" else None
         num_inputs = shape.numel() if self.convolutions is None else self.convolutions.num_features
-        self.linear = linear_layer(num_inputs + num_extra, num_features)
+        self.num_inputs = num_inputs
+        self.num_ids = num_ids
+        self.linear = linear_layer(num_inputs + num_ids + num_extra, num_features)
         self.further = nn.Sequential()
         for _ in range(num_layers - 1):
             self.further.extend([linear_layer(num_features, num_features), nn.ReLU()])
 
     def forward(self, observation: Tensor, *extra: Tensor) -> Tensor:
-        """Map uint8 [..., *shape] and further inputs, [..., n] each, to [..., num_features] of the weights' dtype."""
+        """Map uint8 [..., *shape], a task's number where ids are read, and further inputs to features.
+
+        Args:
+            observation: uint8 [..., *shape].
+            extra: int64 [..., 1], -1 for none, where ids are read; and further inputs, [..., n] each.
+
+        Returns:
+            [..., num_features] of the weights' dtype.
+        """
         dtype = self.linear.weight.dtype
         inputs = observation.flatten(-self.event_dims).to(dtype) * self.scale
         if self.convolutions is not None:
             inputs = self.convolutions(inputs)
-        inputs = joined(inputs, *(values.to(dtype) for values in extra))
-        return self.further(self.linear(inputs).relu())
+        others = [values.to(dtype) for values in extra[bool(self.num_ids) :]]
+        inputs = joined(inputs, *others)
+        if not self.num_ids:
+            return self.further(self.linear(inputs).relu())
+        of_inputs, of_ids, of_others = self.linear.weight.tensor_split(
+            [self.num_inputs, self.num_inputs + self.num_ids], dim=1
+        )
+        weight = torch.cat([of_inputs, of_others], dim=1) if others else of_inputs
+        number = extra[0].squeeze(-1)
+        of_number = of_ids.t().index_select(0, number.clamp(min=0).flatten()).unflatten(0, number.shape)
+        hidden = nn.functional.linear(inputs, weight, self.linear.bias) + of_number * (extra[0] >= 0)
+        return self.further(hidden.relu())
 
 
 class EncoderModule(TensorDictModule):
@@ -318,7 +341,7 @@ def highest(spec: TensorSpec) -> float:
 def encoder(
     observation_spec: Composite, num_features: int, num_layers: int = 1, kind: str = "mlp", **extra: int
 ) -> EncoderModule:
-    """Build an encoder that reads ``observation`` and, if the environment has it, ``task_id``; it writes ``features``.
+    """Build an encoder that reads ``observation`` and the task's id, if the environment shows it; writes ``features``.
 
     Args:
         observation_spec: the environment's, without batch dimensions.
@@ -328,10 +351,21 @@ def encoder(
         extra: further keys to read, with their widths.
     """
     spec = observation_spec["observation"]
-    if "task_id" in observation_spec.keys():  # noqa: SIM118, a Composite is no dict
-        extra = {"task_id": observation_spec["task_id"].shape.numel(), **extra}
-    module = Encoder(spec.shape, highest(spec), num_features, num_layers, num_extra=sum(extra.values()), kind=kind)
-    return EncoderModule(module, in_keys=["observation", *extra], out_keys=["features"])
+    shown = observation_spec.keys()
+    length = observation_spec["task_id"].shape.numel() if "task_id" in shown else 0
+    reads_number = TASK_NUMBER in shown
+    if length and not reads_number:
+        extra = {"task_id": length, **extra}
+    module = Encoder(
+        spec.shape,
+        highest(spec),
+        num_features,
+        num_layers,
+        num_extra=sum(extra.values()),
+        num_ids=length if reads_number else 0,
+        kind=kind,
+    )
+    return EncoderModule(module, in_keys=["observation", *[TASK_NUMBER] * reads_number, *extra], out_keys=["features"])
 
 
 def recurrent(

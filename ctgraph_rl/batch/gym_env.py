@@ -17,7 +17,7 @@ from typing_extensions import override
 
 from ctgraph_rl.batch.assignment import one_hot_ids, require_num_ids
 from ctgraph_rl.batch.rows import seed_rule
-from ctgraph_rl.batch.specs import done_spec, observation_spec, reward_spec
+from ctgraph_rl.batch.specs import TASK_NUMBER, done_spec, observation_spec, reward_spec
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule, require, require_all, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import beside
@@ -222,6 +222,7 @@ class GymEnv(EnvBase):
         if self.num_task_ids:
             ids = torch.tensor([self._ids.get(task, -1) for task in self.tasks], device=self.device, dtype=torch.int64)
             data["task_id"] = one_hot_ids(ids, self.num_task_ids)
+            data[TASK_NUMBER] = ids.unsqueeze(-1)
         return data
 
     def _episode_seed(self, row: int) -> int:

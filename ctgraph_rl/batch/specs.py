@@ -14,6 +14,9 @@ from ctgraph_rl.core.dynamics import OUTCOME_GOAL, OUTCOME_RUNNING
 from ctgraph_rl.tasks.images import white_level
 from ctgraph_rl.tasks.task import Task
 
+TASK_NUMBER = "task_number"
+"""The key of task ids as one integer a row, int64 [N, 1]: where ``task_id`` has its 1, and -1 where it is zero."""
+
 
 class Specs(NamedTuple):
     """What a policy reads and writes."""
@@ -68,6 +71,7 @@ def observation_spec(
         keys["leaf"] = number.clone()
     if num_task_ids:
         keys["task_id"] = Bounded(0, 1, shape=(*batch_size, num_task_ids), dtype=torch.uint8, device="cpu")
+        keys[TASK_NUMBER] = Bounded(-1, num_task_ids - 1, shape=column, dtype=torch.int64, device="cpu")
     return Composite(keys, shape=batch_size, device="cpu")
 
 

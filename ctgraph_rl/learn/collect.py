@@ -282,6 +282,8 @@ def stack_steps(steps: Sequence[Step], env: EnvBase) -> TensorDict:
     """Steps as one TensorDict, [rows, steps]."""
     batch = TensorDict(batch_size=[*env.batch_size, len(steps)], device=env.device)
     for key in {**steps[0], **steps[-1]}:
-        values = torch.stack([step[key] for step in steps if key in step], dim=1)
+        parts = [step[key] for step in steps if key in step]
+        constant = all(part is parts[0] for part in parts)  # long task ids, without a copy for each step
+        values = parts[0].unsqueeze(1) if constant else torch.stack(parts, dim=1)
         batch.set(key, values.expand(-1, len(steps), *[-1] * (values.ndim - 2)))
     return batch

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from torch.nn.functional import one_hot
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from ctgraph_rl.batch.specs import TASK_NUMBER
 from ctgraph_rl.checks import Rule, fraction, require, takes_numbers
 from ctgraph_rl.core.graph import WAIT_ACTION, StateType
 from ctgraph_rl.core.rewards import Arrival
@@ -230,6 +231,8 @@ class _Shown:
         }
         if self.task_id is not None:
             data["task_id"] = self.task_id.expand(len(images), -1)
+            number = self.task_id.long().argmax() if self.task_id.any() else -1
+            data[TASK_NUMBER] = torch.full([len(images), 1], int(number), dtype=torch.int64, device="cpu")
         return data
 
 

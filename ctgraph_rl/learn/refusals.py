@@ -9,6 +9,7 @@ from typing import Any
 from torchrl.envs import EnvBase
 
 from ctgraph_rl.agent import Agent
+from ctgraph_rl.batch.specs import TASK_NUMBER
 from ctgraph_rl.checks import Rule, require
 from ctgraph_rl.core.rewards import KERNEL_REWARDS
 from ctgraph_rl.env import CTGraphEnv
@@ -58,7 +59,7 @@ def check_env(curriculum: Curriculum, env: EnvBase) -> None:
 
 def check_ids(curriculum: Curriculum, agent: Agent) -> None:
     """Refuse an agent made for task ids where the curriculum shows none."""
-    reads = "task_id" in (getattr(agent.policy, "in_keys", None) or ())
+    reads = {"task_id", TASK_NUMBER} & set(getattr(agent.policy, "in_keys", None) or ())
     shows = curriculum.protocol.task_id == "one_hot"
     message = f"{type(agent).__name__} reads task ids, which {curriculum.name} does not show"
     require((shows or not reads, f"{message}; give it a curriculum with protocol.task_id=one_hot, or make a new agent"))

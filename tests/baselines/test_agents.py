@@ -116,7 +116,7 @@ def test_an_agent_reads_the_task_id_where_the_environment_shows_it(compose, name
     agent.learn(batch)
 
     assert batch["task_id"][:2, 0].tolist() == [[1, 0, 0], [0, 1, 0]]
-    assert "task_id" in agent.policy.in_keys
+    assert "task_number" in agent.policy.in_keys
     changed = (features.linear.weight != before).any(dim=0)[144:147].tolist()
     assert changed == [True, True, False]
 
