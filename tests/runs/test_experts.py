@@ -12,7 +12,7 @@ from helpers.sweeping import command_line
 
 from ctgraph_rl import Block, Curriculum, Evaluation, Protocol, RunLog
 from ctgraph_rl.log import files
-from ctgraph_rl.log.provenance import versions
+from ctgraph_rl.log.provenance import NUMBERS, versions
 from ctgraph_rl.run import run
 from ctgraph_rl.runs import job
 from ctgraph_rl.runs.experts import directory_name, expert_curriculum, find_or_train
@@ -175,7 +175,8 @@ def test_an_expert_is_kept_by_agent_seed_device_threads_and_versions(compose, mo
 
     agent = {**asked[0][3].pop("agent")}
     assert (agent["_target_"], agent["gamma"]) == (cfg.agent._target_, 0.5)
-    assert asked == [{3: {"seed": 3, "device": "cpu", "num_threads": 1, "versions": versions()}}]
+    made = {"seed": 3, "device": "cpu", "num_threads": 1, "versions": versions(), "numbers": NUMBERS}
+    assert asked == [{3: made}]
 
 
 def test_experts_that_cannot_be_are_refused_before_anything_is_written(compose, tmp_path):
