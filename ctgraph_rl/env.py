@@ -359,7 +359,7 @@ class CTGraphEnv(EnvBase):
         return data | self._show_ids() if self.num_task_ids else data
 
     def _show_ids(self) -> RowData:
-        """Return the rows' task ids, one-hot, uint8 [N, num_task_ids], and as numbers; made where tasks have changed."""
+        """Return the rows' task ids, one-hot and as numbers, by key; the same tensors until tasks change."""
         task, shown = self._task_id
         if task is not self.rows.task:
             ids = self._id_of_task.index_select(0, self.rows.task)

@@ -121,6 +121,38 @@ def test_an_agent_reads_the_task_id_where_the_environment_shows_it(compose, name
     assert changed == [True, True, False]
 
 
+def test_an_encoder_reads_the_number_of_a_task_as_the_one_hot_vector_and_none_as_zeros():
+    torch.manual_seed(0)
+    by_number = Encoder(torch.Size([12]), 1.0, 8, num_extra=2, num_ids=5).double()
+    by_vector = Encoder(torch.Size([12]), 1.0, 8, num_extra=7).double()
+    by_vector.load_state_dict(by_number.state_dict())
+    seen, extra = torch.rand(3, 6, 12, dtype=torch.float64), torch.rand(3, 6, 2, dtype=torch.float64)
+    number = torch.randint(-1, 5, (3, 6, 1))
+    vector = (number == torch.arange(5)).byte()
+
+    ways = by_number(seen, number, extra), by_vector(seen, vector, extra)
+
+    assert (number == -1).any()
+    by = torch.randn_like(ways[0])
+    gradients = [
+        torch.autograd.grad(way, list(net.parameters()), by)
+        for way, net in zip(ways, (by_number, by_vector), strict=True)
+    ]
+    torch.testing.assert_close((ways[0], gradients[0]), (ways[1], gradients[1]), atol=1e-12, rtol=1e-12)
+
+
+def test_task_ids_are_shown_as_vectors_and_numbers_which_a_batch_holds_once():
+    tasks = [ct_su_b1((1, 2)), ct_su_b1((2, 1)), ct_su_b1((1, 1))]
+    env = CTGraphEnv(tasks, task_ids={task: i for i, task in enumerate(tasks[:2])}, num_task_ids=1000)
+
+    _, batch = collect(env, lambda data: data.set("action", env.action_spec.rand()), 48, 8)
+
+    for shown in (batch, batch["next"]):
+        assert shown["task_number"].squeeze(-1).unique(dim=1).tolist() == [[0], [1], [-1]]
+        assert torch.equal(shown["task_id"], (shown["task_number"] == torch.arange(1000)).byte())
+        assert shown["task_id"].stride(1) == 0
+
+
 @every_agent
 def test_an_agent_takes_the_task_that_starts_or_none(small_agent, name):
     agent = small_agent(name, [ct_su_b1()])

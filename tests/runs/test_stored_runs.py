@@ -15,8 +15,8 @@ from helpers.paths import DATA
 from helpers.sweeping import command_line
 
 import ctgraph_rl
-from ctgraph_rl.log.files import AGENT, CHECKPOINTS, LOG, METRICS
 from ctgraph_rl.log import provenance
+from ctgraph_rl.log.files import AGENT, CHECKPOINTS, LOG, METRICS
 from ctgraph_rl.log.provenance import machine, versions
 from ctgraph_rl.runs.checkpoints import Checkpoints
 
