@@ -33,9 +33,8 @@ from ctgraph_rl.checks import NamedValues, Rule, is_int, is_real, require
 from ctgraph_rl.disk import make_folder, write_whole
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
 from ctgraph_rl.log.files import locked
-from ctgraph_rl.log.provenance import machine, versions
+from ctgraph_rl.log.provenance import is_ours, machine, targets, versions
 from ctgraph_rl.log.refuse import refused_by
-from ctgraph_rl.log.sources import is_ours, targets
 from ctgraph_rl.packages import check_packages
 from ctgraph_rl.parsers import LEVELS, LIMIT_TIMES
 from ctgraph_rl.portable import cpu_model

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from importlib import import_module
 from itertools import filterfalse
+from types import FunctionType
 from typing import Any
 
 import tensordict
@@ -16,7 +17,7 @@ import torchrl
 from ctgraph_rl import __version__
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues
 from ctgraph_rl.log.run_log import SCHEMA
-from ctgraph_rl.log.sources import find_sources, full_name, is_ours, targets
+from ctgraph_rl.log.sources import OURS, find_sources
 from ctgraph_rl.packages import check_packages
 from ctgraph_rl.portable import cpu_model, is_portable
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -90,7 +91,10 @@ def code(curriculum: Curriculum, names: Iterable[str] | None = ()) -> NamedValue
         names: classes and functions that learn, such as ``my_agent.MyAgent``, of which the user's sources count; None
             if they are not known.
     """
-    known = None if names is None else find_sources([*names, *dict.fromkeys(_parts(curriculum))])
+    known: dict[str, str | None] | None = None
+    if names is not None:
+        others = [name for name in (*names, *dict.fromkeys(_parts(curriculum))) if not is_ours(name)]
+        known = find_sources(others) if others else {}
     return {"fingerprint": curriculum.fingerprint, "numbers": NUMBERS, "sources": known}
 
 
@@ -163,3 +167,24 @@ def machine() -> NamedValues:
     instructions = "portable" if is_portable() else torch.backends.cpu.get_cpu_capability()
     kind = f"{platform.machine()} {instructions}"
     return {"machine": kind, "num_threads": torch.get_num_threads()}
+
+
+def targets(settings: Any) -> Iterator[str]:
+    """Yield the names of classes and functions that a configuration builds or hands on, at any depth."""
+    if isinstance(settings, Mapping):
+        name = str(settings.get("_target_", ""))
+        if name:
+            yield str(settings.get("path")) if name.startswith("hydra.utils.get_") else name
+    if isinstance(settings, (Mapping, list, tuple)):
+        for each in settings.values() if isinstance(settings, Mapping) else settings:
+            yield from targets(each)
+
+
+def is_ours(name: str) -> bool:
+    """Return whether a class or function is of this package."""
+    return name.partition(".")[0] in OURS
+
+
+def full_name(kind: type | FunctionType) -> str:
+    """Return the dotted name of a class or function."""
+    return f"{kind.__module__}.{kind.__qualname__}"

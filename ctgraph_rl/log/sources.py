@@ -13,13 +13,12 @@ import ast
 import hashlib
 import sys
 import sysconfig
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from importlib import metadata
 from importlib.machinery import ModuleSpec, PathFinder
 from importlib.util import find_spec
 from pathlib import Path
-from types import FunctionType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 OURS = ("ctgraph_rl", "baselines", "curricula", "hydra_plugins")
 """Packages whose changes the numbers version tells."""
@@ -247,24 +246,3 @@ def _has_no_effect(node: ast.AST) -> bool:
 
 def _hash(text: str) -> str:
     return hashlib.sha256(text.encode("ascii", "backslashreplace")).hexdigest()[:16]
-
-
-def targets(settings: Any) -> Iterator[str]:
-    """Yield the names of classes and functions that a configuration builds or hands on, at any depth."""
-    if isinstance(settings, Mapping):
-        name = str(settings.get("_target_", ""))
-        if name:
-            yield str(settings.get("path")) if name.startswith("hydra.utils.get_") else name
-    if isinstance(settings, (Mapping, list, tuple)):
-        for each in settings.values() if isinstance(settings, Mapping) else settings:
-            yield from targets(each)
-
-
-def is_ours(name: str) -> bool:
-    """Return whether a class or function is of this package."""
-    return name.partition(".")[0] in OURS
-
-
-def full_name(kind: type | FunctionType) -> str:
-    """Return the dotted name of a class or function."""
-    return f"{kind.__module__}.{kind.__qualname__}"

@@ -23,8 +23,8 @@ from ctgraph_rl.learn.progress import Count, silent
 from ctgraph_rl.log.damage import metrics_of
 from ctgraph_rl.log.files import FAILURE, LOG, METRICS, MOST_BYTES_OF_METRICS, no_run, without_sweeps_files
 from ctgraph_rl.log.measurement import check, parsed
+from ctgraph_rl.log.provenance import is_ours, targets
 from ctgraph_rl.log.run_log import MOST_BYTES, SCHEMA, RunLog, label_of
-from ctgraph_rl.log.sources import is_ours, targets
 from ctgraph_rl.metrics.adaptation import Adaptation
 from ctgraph_rl.runs.experts import EXPERT
 from ctgraph_rl.runs.settings import as_before, flat

@@ -28,10 +28,9 @@ from ctgraph_rl.learn.adapt import adapt
 from ctgraph_rl.learn.collect import Policy, agent_specs
 from ctgraph_rl.learn.evaluate import Evaluator, by_slices
 from ctgraph_rl.log.files import CHECKPOINTS, LOG, METRICS
-from ctgraph_rl.log.provenance import code_changes
+from ctgraph_rl.log.provenance import code_changes, full_name
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.scores import scores
-from ctgraph_rl.log.sources import full_name
 from ctgraph_rl.runs.checkpoints import SECONDS, Checkpoints
 from ctgraph_rl.runs.session import RunMember, Session, is_whole
 from ctgraph_rl.runs.settings import differences, flat

@@ -13,7 +13,8 @@ from zipfile import ZipFile
 import pytest
 
 import ctgraph_rl.log.sources
-from ctgraph_rl.log.sources import find_sources, read_module, targets
+from ctgraph_rl.log.provenance import targets
+from ctgraph_rl.log.sources import find_sources, read_module
 
 EVERYTHING = '''
 """A module with the syntax whose trees differ between versions of Python."""
@@ -207,7 +208,8 @@ def test_of_a_script_what_a_class_needs_counts(tmp_path, write):
         def width(): return SIZE + helper.x
         class Agent:
             size = width()
-        from ctgraph_rl.log.sources import find_sources, full_name
+        from ctgraph_rl.log.provenance import full_name
+        from ctgraph_rl.log.sources import find_sources
         print(json.dumps(find_sources([full_name(Agent)])))
     """
 

@@ -10,7 +10,7 @@ import pytest
 from helpers.sweeping import command_line
 
 from ctgraph_rl import load, run
-from ctgraph_rl.log import sources
+from ctgraph_rl.log import provenance
 from ctgraph_rl.log.files import AGENT, CHECKPOINTS
 from ctgraph_rl.runs import job, read, settings
 from ctgraph_rl.runs.checkpoints import Checkpoints
@@ -52,7 +52,7 @@ def command(tmp_path, monkeypatch):
         (tmp_path / "conf" / "agent" / "mine.yaml").write_text(YAML + more)
         (tmp_path / "added_later.py").write_text(CODE.format(argument="cell, " if more else ""))
         sys.modules.pop("added_later", None)
-        monkeypatch.setattr(sources, "OURS", (*sources.OURS, "added_later"))  # it stands for a module of this package
+        monkeypatch.setattr(provenance, "OURS", (*provenance.OURS, "added_later"))  # as a module of ours
         monkeypatch.setattr(settings, "ADDED", {} if added is None else {"added_later.Agent": {"cell": "lstm"}})
         monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
         monkeypatch.setattr(sys, "argv", ["ctgraph-rl", "--config-dir", "conf", *SHORT, "agent=mine", *overrides])
