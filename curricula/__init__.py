@@ -1,7 +1,7 @@
-"""Named task sequences that a paper can cite; importable without Hydra, torchrl or a configuration file.
+"""Named task sequences that a paper can cite.
 
-``curricula.load("ct8")`` and ``curricula.ct8()`` are the curriculum as published; both take arguments that change it,
-such as ``num_frames``. `names` lists all, and ``curricula.axes`` has the functions that make other sequences.
+``curricula.load("ct8")`` and ``curricula.ct8()`` are as published; arguments such as ``num_frames`` change them.
+`names` lists all, and ``curricula.axes`` makes other sequences.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ctgraph_rl.tasks.curriculum import Curriculum
 
 _MODULES = ("adaptation", "gym", "masks", "memory", "paper", "profile", "sharing", "task_free")
-"""Each has a table ``NAMED`` of its curricula by name."""
+"""Modules whose ``NAMED`` has their curricula."""
 
 _HOMES = {
     "MISSING": "published",
@@ -35,13 +35,13 @@ __all__ = ["MISSING", "from_axes", "from_graph", "from_meta_json", "load", "name
 
 
 def names() -> list[str]:
-    """Names of all curricula, but for those that need a package which is not installed."""
+    """Names of all curricula, without those that need a missing package."""
     needs = import_module("curricula.gym").NEEDS
     return sorted(name for name in _named() if name not in needs or find_spec(needs[name]) is not None)
 
 
 def load(name: str, **arguments: Any) -> Curriculum:
-    """A curriculum by name; arguments change it.
+    """A curriculum by name, changed by arguments.
 
     Raises:
         ValueError: for an unknown name or argument; lists the choices.
@@ -60,9 +60,8 @@ def load(name: str, **arguments: Any) -> Curriculum:
 
 
 def listed() -> tuple[tuple[str, ...], ...]:
-    """Return name, version, number of tasks, frames, fingerprint and source of each curriculum, as stored texts.
-
-    None of them is loaded, as torch takes seconds.
+    """Return name, version, number of tasks, frames, fingerprint and source of each curriculum, stored as torch loads
+    slowly.
     """
     stored = json.loads(Path(__file__).with_name("fingerprints.json").read_text(encoding="utf-8"))
     return tuple(
@@ -72,7 +71,7 @@ def listed() -> tuple[tuple[str, ...], ...]:
 
 
 def summary(name: str) -> str:
-    """Return a sentence on a curriculum.
+    """Return the first line of a curriculum's docstring.
 
     Raises:
         ValueError: for an unknown name; lists the choices.

@@ -12,7 +12,7 @@ from curricula import listed
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """The command line, ``ctgraph-rl curricula``; a list of what is published needs no torch."""
+    """The command line; listing published curricula needs no torch."""
     parser = _parser()
     arguments = parser.parse_args(argv, argparse.Namespace(format="text", config_dir=None))
     with refused_by(parser):
@@ -37,7 +37,7 @@ def _compute(arguments: argparse.Namespace) -> None:
 
 
 def _show_list(rows: tuple[tuple[str, ...], ...], form: str) -> None:
-    """Print a line for each curriculum; on a terminal the sources stand below."""
+    """Print a line for each curriculum, with sources below on a terminal."""
     sheet = Sheet("Curricula", LISTED, rows)
     show([with_numbers(sheet) if form == "text" else sheet], form)
 

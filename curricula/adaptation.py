@@ -24,15 +24,14 @@ NM = "Ben-Iwhiwhu et al. 2022, Neural Networks; github.com/dlpbc/nm-metarl"
 UNANNOUNCED = Protocol(boundaries="hidden")
 
 MOST_LIVES = 10_000
-"""Each takes two blocks."""
+"""Each has two blocks."""
 
 
 def swoks_2x4(num_frames: int = 384_000) -> Curriculum:
     """Statistical context detection: the four goals of a depth-2 graph in reverse order, twice, unannounced.
 
     A stay is 750 iterations of 4 workers x 128 steps; a configuration file of the repository has 16 workers instead.
-    Episodes were cut at every iteration there, which is not done here. The evaluation of the authors is not known: our
-    defaults.
+    There each iteration cut the episodes; here none does. The evaluation is our default.
 
     Args:
         num_frames: frames per stay.
@@ -47,20 +46,20 @@ def penn_a_swap(
 ) -> Curriculum:
     """The goal swap of evolved neuromodulated networks: a goal, then unannounced another one, drawn uniformly.
 
-    There a trial had 100 episodes and the swap came at a random one of the episodes 35 to 65. Here each row plays a
-    trial, and the swap comes after the frames that 50 of the longest episodes take: frames, not episodes, are counted,
-    and the moment does not vary. An agent's fitness was the mean of 4 trials; how often to evaluate is our default.
+    There a trial had 100 episodes with a swap at random in episodes 35 to 65, and fitness was the mean of 4 trials.
+    Here each row plays a trial and swaps after the frames of 50 longest episodes. The times of evaluation are our
+    default.
 
-    With ``num_lives`` rows play one trial after the other, of 100 of the longest episodes, each with two goals and a
-    swap after 35 to 65 of them. The rows of a trial swap at once, and begin with all goals equally. A row of an
-    evaluation plays 100 episodes, of a goal that stays, and held out of one that is drawn again after 50 of them.
+    With ``num_lives`` rows play trials of 100 longest episodes in turn, with a swap after 35 to 65 of them, all rows at
+    once. Goals are equally often first. An evaluation's row plays 100 episodes of a goal that stays; held-out ones draw
+    another after 50.
 
     Args:
         num_frames: frames of each half, all rows together; None: 50 episodes of 2 d + 3 steps for each row.
         depth: 2 or 3.
         num_rows: trials side by side, for the default of ``num_frames``.
         seed: draws the goals, and the moments of swaps.
-        num_lives: trials of a row, one after the other, without ``num_frames``; None: one.
+        num_lives: trials of a row in turn, without ``num_frames``; None: one.
     """
     require(
         (depth in (2, 3), f"depth must be 2 or 3, as published, got {depth!r}"),
@@ -92,7 +91,7 @@ def penn_a_swap(
 
 
 def _lives(goals: Tasks, num_lives: int, seed: int) -> tuple[list[Tasks], list[int]]:
-    """Draw the tasks of the rows before and after the swap of each life, and after how many episodes it comes."""
+    """Draw the rows' tasks before and after the swap of each life, and the episodes before it."""
     source = generator(seed)
     count = len(goals)
     tasks = []
@@ -109,9 +108,8 @@ def dick2020_pair(num_frames: int = 51_200, one_hot: bool = True) -> Curriculum:
     """Two depth-2 graphs that differ in one transition, without notice: a change of task that is hard to detect.
 
     Section 4.2 of the CT-graph paper: the graphs "had a single variation in the transition matrix". No configuration
-    was published. Here all wait states show one observation and all decision states another, as in CT-SU-B1, and each
-    end state has its own, so that the change is seen. In the second task the branches behind the first one are swapped:
-    the same goal is reached by the decisions (1, 2) instead of (1, 1).
+    was published. Here observations are as in CT-SU-B1, but each end state has its own, so that the change is seen. In
+    the second task the branches behind the first one are swapped: (1, 2) reaches the same goal instead of (1, 1).
 
     Args:
         num_frames: frames per task.
@@ -124,17 +122,17 @@ def dick2020_pair(num_frames: int = 51_200, one_hot: bool = True) -> Curriculum:
 
 
 META_BATCHES = {1: (501, 20, 20, 40), 2: (501, 20, 20, 40), 3: (1001, 40, 25, 40), 4: (1501, 20, 60, 100)}
-"""By depth: batches, tasks in a batch, episodes of a task before and again after its adaptation, test episodes."""
+"""By depth: batches, tasks in a batch, episodes of a task before and after its adaptation, test episodes."""
 
 
 @takes_numbers
 def nm_uniform_goals(num_frames: int | None = None, depth: int = 2, kind: str = "full") -> Curriculum:
     """The meta-learning tasks of the neuromodulated-context paper: a uniform random goal for each task.
 
-    The observations are vectors of a fully observable graph. A goal lasts as long as a task there: the episodes before
-    and after its adaptation; then the row draws another, the same one among them. Rows begin with all goals equally.
-    The authors count batches: the frames are what these would take with the longest episodes, a bound from above,
-    rounded up to a multiple of 512. A test has as many episodes of one goal as theirs has between adaptations, sampled.
+    The graph is fully observable, with vectors. A goal lasts as long as a task there, the episodes before and after its
+    adaptation; then the row draws any goal. Goals are equally often first. The frames bound the authors' batches from
+    above, by the longest episodes, rounded up to a multiple of 512. A test has as many episodes of a goal as theirs
+    between adaptations, sampled.
 
     Args:
         num_frames: frames of all rows together; None: the bound.
@@ -155,16 +153,16 @@ def nm_uniform_goals(num_frames: int | None = None, depth: int = 2, kind: str = 
 
 @takes_numbers
 def goal_search(num_frames: int = 409_600, depth: int = 2, num_image_sets: int = 4) -> Curriculum:
-    """Half of the goals on some image sets; held out are the other half, and all goals on one image set more.
+    """Half of the goals on some image sets; held out are the other half, and all goals on a new image set.
 
-    A learner that knows the trained goals by heart finds these faster than the best search for a goal of all, and the
-    held-out ones not at all. Tasks are fully observable. The trained goals have an even number of second decisions. A
-    row has one task, for all its episodes; in an evaluation it plays one for each goal before those that count.
+    A learner that knows the trained goals by heart finds these faster than the best search among all, and never the
+    held-out ones. Tasks are fully observable; trained goals have an even number of second decisions. A row keeps its
+    task; in an evaluation it first plays as many episodes as there are goals.
 
     Args:
         num_frames: frames of all rows together.
         depth: of the graph.
-        num_image_sets: image sets that are trained, with the image seeds 1, 2 and so on.
+        num_image_sets: trained image sets, with the image seeds 1, 2 and so on.
     """
     require(*at_least_one(depth=depth, num_image_sets=num_image_sets))
     tasks = [task for seed in range(1, num_image_sets + 1) for task in all_goals(full_mdp("0" * depth, seed))]
@@ -182,9 +180,8 @@ def goal_search(num_frames: int = 409_600, depth: int = 2, num_image_sets: int =
 
 
 def _longest_episode(depth: int) -> int:
-    """Steps for p=0: home, a wait and a decision for each level, a wait, and the extra step at the end."""
+    """Steps for p=0, the extra step at the end included."""
     return 2 * depth + 3
 
 
 NAMED = by_name(dick2020_pair, goal_search, nm_uniform_goals, penn_a_swap, swoks_2x4)
-"""The curricula of this module by name."""

@@ -1,8 +1,8 @@
 """The axes along which tasks differ, and the ways to put tasks in order.
 
-An axis takes a task, or several, and returns the variations of each, those of the first task first. So axes combine by
-applying one to what another returns: ``all_goals(image_seeds(task, (1, 2)))`` is every goal with the images of seed 1,
-then every goal with those of seed 2. `product` writes the same as a list. `sequence` makes a `Curriculum` of tasks.
+An axis takes a task, or several, and returns the variations of each, those of the first task first. So axes combine:
+``all_goals(image_seeds(task, (1, 2)))`` is every goal with the images of seed 1, then with those of seed 2. `product`
+writes the same as a list. `sequence` makes a `Curriculum`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ OneOrMore = Task | Iterable[Task]
 Axis = Callable[[Tasks], Tasks]
 
 MOST_TASKS = 100_000
-"""More tasks than this are refused before they are built."""
+"""More are refused before they are built."""
 
 
 def as_tasks(tasks: OneOrMore) -> Tasks:
@@ -74,12 +74,7 @@ def given_goals(tasks: OneOrMore, goals: Iterable[Goal]) -> Tasks:
 
 @takes_numbers
 def goals_sharing(tasks: OneOrMore, num_decisions: int) -> Tasks:
-    """Every goal that shares its first decisions with the task's own, in lexicographic order.
-
-    Args:
-        tasks: a task or several.
-        num_decisions: k in 0..d; 0 gives all goals, d only the task.
-    """
+    """Every goal that shares its first ``num_decisions`` in 0..d with the task's own, in lexicographic order."""
 
     def vary(task: Task) -> Iterable[Task]:
         b = task.graph.branching_factor
@@ -96,11 +91,11 @@ def goals_sharing(tasks: OneOrMore, num_decisions: int) -> Tasks:
 
 @takes_numbers
 def random_goals(tasks: OneOrMore, num_goals: int, seed: int) -> Tasks:
-    """Different goals drawn uniformly; the same ones for all tasks whose graphs have one shape.
+    """Different goals drawn uniformly, the same for graphs of one shape.
 
     Args:
         tasks: a task or several.
-        num_goals: how many, at most b^d.
+        num_goals: at most b^d.
         seed: an integer >= 0.
     """
 
@@ -129,7 +124,7 @@ def image_seeds(tasks: OneOrMore, seeds: Iterable[int]) -> Tasks:
 
 
 def image_sets(tasks: OneOrMore, sets: Iterable[ImageSet]) -> Tasks:
-    """Each task with other image sets, such as ``ImageFile.of("digits.npy")``; all of one shape."""
+    """Each task with other image sets of one shape, such as ``ImageFile.of("digits.npy")``."""
     listed = tuple(sets)
     return each(tasks, lambda task: [replace(task, images=images) for images in listed])
 
@@ -138,13 +133,12 @@ def image_sets(tasks: OneOrMore, sets: Iterable[ImageSet]) -> Tasks:
 def shifted_ids(tasks: OneOrMore, shifts: Iterable[int], kinds: Sequence[str] = ("wait", "decision", "end")) -> Tasks:
     """Each task with the images of some kinds of states moved to higher ids of the same image set.
 
-    Generated sets grow to the longest that is needed, for all shifts alike, and longer sets begin with shorter ones:
-    what is not moved looks the same in all tasks.
+    Generated sets grow to the longest that is needed, so that unmoved images look the same in all tasks.
 
     Args:
         tasks: a task or several.
         shifts: how far ids move; 0 is the task itself.
-        kinds: which states: some of home, fail, wait, decision and end.
+        kinds: some of home, fail, wait, decision and end.
     """
     listed = require_all(int, "shifts", shifts)
     moved = require_all(str, "kinds", kinds)
@@ -167,13 +161,11 @@ def shifted_ids(tasks: OneOrMore, shifts: Iterable[int], kinds: Sequence[str] = 
 
 @takes_numbers
 def new_images(tasks: OneOrMore, num_sets: int, kinds: Sequence[str] = ("decision",)) -> Tasks:
-    """Each task, and again with images never seen before for some kinds of states; the others keep theirs.
-
-    The paper's variant and invariant features: new decision images with shared wait images, or the other way round.
+    """Each task, and again with new images for some kinds of states: the paper's variant and invariant features.
 
     Args:
         tasks: a task or several.
-        num_sets: how many sets of images, the task's own included.
+        num_sets: sets of images, the task's own included.
         kinds: the states whose images change.
     """
     require((is_int(num_sets, 1, MOST_TASKS), f"num_sets must be an integer >= 1, got {num_sets!r}"))
@@ -194,7 +186,7 @@ def new_images(tasks: OneOrMore, num_sets: int, kinds: Sequence[str] = ("decisio
 
 @takes_numbers
 def read_variation(tasks: OneOrMore, read_noise: int, read_rotation: int = 0) -> Tasks:
-    """Each task with images that vary whenever they are read; see `Observations`.
+    """Each task with images that vary on every read.
 
     Args:
         tasks: a task or several, with images.
@@ -214,13 +206,13 @@ def read_variation(tasks: OneOrMore, read_noise: int, read_rotation: int = 0) ->
 
 @takes_numbers
 def growing_depth(tasks: OneOrMore, depths: Iterable[int], nested: bool = True) -> Tasks:
-    """The graph of each task cut to other depths, every one with the id ranges of the deepest: no image changes role.
+    """The graph of each task cut to other depths, all with the id ranges of the deepest: no image changes role.
 
     Args:
         tasks: the deepest graph with its goal, or several.
         depths: each at most the graph's own.
-        nested: the goal at a depth is the first decisions of the task's goal, so a shallow goal is on the path of
-            every deeper one. False: its last decision is another one, so that no shallow goal is on a deeper path.
+        nested: a goal is the first decisions of the task's goal, on the path of every deeper one. False: its last
+            decision is another one, so that no shallow goal is on a deeper path.
     """
     listed = require_all(int, "depths", depths)
 
@@ -241,7 +233,7 @@ def growing_depth(tasks: OneOrMore, depths: Iterable[int], nested: bool = True) 
 
 @takes_numbers
 def branching_factors(tasks: OneOrMore, factors: Iterable[int]) -> Tasks:
-    """Each task with other branching factors; the task is the widest, whose id ranges serve all."""
+    """Each task with other branching factors, up to its own, whose id ranges serve all."""
     listed = require_all(int, "factors", factors)
 
     def vary(task: Task) -> list[Task]:
@@ -268,10 +260,9 @@ def observability(tasks: OneOrMore, kinds: Iterable[str], num_wait_images: int =
     """Each task as more or less of its state is seen.
 
     Args:
-        tasks: a task or several, with images for every id or a generated set, which gets the length it needs.
-        kinds: some of ``full``, an image for each state; ``decisions``, as full but one image for all wait states;
-            ``surjective``, one image for each kind of state; ``confounding``, as surjective but wait states draw one
-            of ``num_wait_images`` at every observation.
+        tasks: a task or several, with enough images or a generated set, which is made long enough.
+        kinds: some of ``full``, ``decisions``, ``surjective`` and ``confounding``, as in
+            `ctgraph_rl.tasks.configurations.observations_of`.
         num_wait_images: for ``confounding``.
     """
     listed = require_all(str, "kinds", kinds)
@@ -280,7 +271,7 @@ def observability(tasks: OneOrMore, kinds: Iterable[str], num_wait_images: int =
 
 @takes_numbers
 def reshaped(task: Task, graph: CTGraph, kind: str, goal: Goal, num_wait_images: int = 100) -> Task:
-    """A task on another graph, observed in one of the ways of `observability`; all else stays."""
+    """A task on another graph, observed by a kind of `observability`."""
     observations = observations_of(graph, kind, num_wait_images)
     images = _with_room(task.images, observations.last_id + 1, exact=True)
     return replace(task, graph=graph, goal=goal, observations=observations, images=images)  # type: ignore[arg-type]
@@ -338,7 +329,7 @@ def _random_goal(graph: CTGraph, source: random.Random) -> tuple[int, ...]:
 
 
 def _with_room(images: ImageSet, num_images: int, exact: bool = False) -> ImageSet:
-    """A generated set of at least, or exactly, so many images; any other set unchanged."""
+    """A generated set of at least, or exactly, so many images; other sets unchanged."""
     settable = "num_images" in {field.name for field in fields(images) if field.init}  # type: ignore[arg-type]
     fits = images.num_images == num_images if exact else images.num_images >= num_images
     return images if fits or not settable else replace(images, num_images=num_images)  # type: ignore
@@ -348,7 +339,7 @@ def _with_room(images: ImageSet, num_images: int, exact: bool = False) -> ImageS
 
 
 def product(tasks: OneOrMore, *axes: Axis) -> Tasks:
-    """Axes applied one after the other: the last one varies fastest."""
+    """Axes applied in turn: the last varies fastest."""
     varied = as_tasks(tasks)
     for axis in axes:
         varied = axis(varied)
@@ -361,7 +352,7 @@ def concatenate(*sequences: OneOrMore) -> Tasks:
 
 
 def interleave(*sequences: OneOrMore) -> Tasks:
-    """The first task of each sequence, then the second of each; a sequence that has ended is left out.
+    """The first task of each sequence, then the second of each; ended sequences are left out.
 
     Example:
         >>> from ctgraph_rl.tasks.configurations import ct_su_b1
@@ -393,7 +384,7 @@ def _check_times(times: object) -> None:
 
 @takes_numbers
 def shuffle(tasks: OneOrMore, seed: int) -> Tasks:
-    """The tasks in an order drawn uniformly from a seed, an integer >= 0."""
+    """The tasks in a uniformly random order; the seed is >= 0."""
     return tuple(shuffled(as_tasks(tasks), seed))
 
 
@@ -404,11 +395,11 @@ def reverse(tasks: OneOrMore) -> Tasks:
 
 @takes_numbers
 def split(tasks: OneOrMore, num_held_out: int, seed: int) -> tuple[Tasks, Tasks]:
-    """Tasks to train and tasks to hold out, drawn without replacement; both keep their order.
+    """Tasks to train and tasks to hold out, drawn without replacement, each in their order.
 
     Args:
         tasks: different tasks.
-        num_held_out: how many to hold out, fewer than there are.
+        num_held_out: fewer than there are.
         seed: an integer >= 0.
     """
     everything = as_tasks(tasks)
@@ -436,13 +427,13 @@ def sequence(
     """A curriculum with a block for each item.
 
     Args:
-        name: name that a paper cites.
+        name: as cited.
         tasks: a task, or several that share a block, for each block.
-        num_frames: frames of every block, or a list with those of each.
-        version: raised when the content changes.
+        num_frames: of every block, or a list with those of each.
+        version: rises when the content changes.
         source: where the sequence comes from.
-        protocol: what the learner knows of tasks; None: no task ids, announced boundaries.
-        evaluation: how performance is measured; None: the defaults of `Evaluation`.
+        protocol: None: no task ids, announced boundaries.
+        evaluation: None: the defaults of `Evaluation`.
         switch: how rows change between the tasks of a block.
     """
     items = [tasks] if isinstance(tasks, Task) else list(tasks)

@@ -1,7 +1,7 @@
 """Curricula whose axes are plain arguments, so that a command line can set them.
 
-Evaluations come eight times in a block, so that the speed of learning is seen: where there are at most `MOST_EVALUATED`
-tasks, and all blocks have the same number of frames, a multiple of 2,048.
+To show the speed of learning each block has eight evaluations, if there are at most `MOST_EVALUATED` tasks and all
+blocks have the same frames, a multiple of 2,048.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ SWITCHES: dict[str, Callable[[int], Any]] = {
 IMAGE_SIZE = 12
 
 EVALUATIONS = 8
-"""In a block, the last one at its end."""
+"""Of a block, the last at its end."""
 
 ROWS = 256
-"""Environments that an evaluation within a block must fit; most agents have as many or a divisor."""
+"""Environments that evaluations within blocks must fit."""
 
 MOST_EVALUATED = 20
-"""Of a curriculum with evaluations within blocks, as each evaluates all tasks."""
+"""Most tasks with evaluations within blocks."""
 
 TRIALS = 50
 """Rows of an evaluation of a task whose goal changes."""
@@ -83,14 +83,13 @@ def from_axes(
 ) -> Curriculum:
     """Any combination of axes; the paper's Table 3 has the names in brackets.
 
-    Lists are combined: the goals vary fastest, then depths, then wait probabilities, then image seeds. All tasks share
-    rewards and the rules of what is observed. The ``protocol`` and ``evaluation`` of a run say what the learner knows
-    and how it is evaluated, for any curriculum.
+    Lists are combined: goals vary fastest, then depths, wait probabilities and image seeds. All tasks share rewards and
+    the rules of what is observed.
 
     Args:
         configuration: where the rest comes from: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
         branching_factor: another b, or several for ``random_graphs``; None: as configured [b].
-        depth: another d, or several: then all have the ids of the deepest graph; None: as configured [d].
+        depth: another d, or several, with the ids of the deepest graph; None: as configured [d].
         wait_prob: another p, or several; None: as configured [p].
         image_seeds: seed of the image set, or several [image set: seed].
         goals: ``all``; ``random``, ``num_goals`` a graph; ``nested``, a random path and its beginnings; or a list of
@@ -101,14 +100,13 @@ def from_axes(
         repeats: how often the whole sequence comes.
         seed: draws random goals and the shuffled order.
         num_frames: frames per block, or a list with those of each.
-        switch: None: a block for each task; else all tasks in one block, between which each row changes: in turns,
-            ``by_episode``; ``at_random``; or by ``drift`` from each task to the next.
-        switch_episodes: episodes between changes, in turns, in the mean, or of a drift.
+        switch: None: a block for each task; else one block, whose rows change task in turns, ``by_episode``;
+            ``at_random``; or by ``drift`` from each to the next.
+        switch_episodes: episodes between changes, on average for ``at_random``, or of a drift.
         name: of the curriculum, in logs and tables.
-        read_noise: largest addition to each pixel whenever an image is read, in 0..255 [noise on read].
-        read_rotation: largest rotation whenever an image is read, whole degrees in 0..359 [rotation on read].
-        random_graphs: how many tasks to draw by ``seed``, each with any of the shapes, images and goals; None: all
-            combinations.
+        read_noise: largest addition to a pixel on each read, in 0..255 [noise on read].
+        read_rotation: largest rotation on each read, whole degrees in 0..359 [rotation on read].
+        random_graphs: how many tasks to draw by ``seed`` from all shapes, images and goals; None: all combinations.
         unique_decisions: whether each decision state has its own image; None: as configured [MDP_D].
         unique_waits: whether each wait state has its own image; None: as configured [MDP_W].
         decision_ids: first and last id of decision states, such as [2,2]; None: the next free ids [D_IDs].
@@ -120,10 +118,10 @@ def from_axes(
         fail_reward: reward at the fail state [fail_r].
         step_reward: reward of every step, in addition [section 2.5].
         reward_std: standard deviation of the noise on the reward of end states [std_r].
-        reward_fn: what end states pay: ``needle``, only the goal; ``gradient``, the nearer the goal the
-            more; ``reference_linear``, as the authors' implementation [g].
+        reward_fn: what end states pay: ``needle``, only the goal; ``gradient``, more nearer the goal;
+            ``reference_linear``, as the authors' implementation [g].
         goal_change: episodes after which each row draws another goal, a number or the fewest and the most, for agents
-            that adapt within a row's life; all tasks then share a block. None: goals stay.
+            that adapt; all tasks then share a block. None: goals stay.
 
     Raises:
         ValueError: for values out of range; lists the choices.
@@ -207,7 +205,7 @@ def from_graph(
     name: str = "graph",
     goal_change: int | Sequence[int] | None = None,
 ) -> Curriculum:
-    """Goals of the graph of a JSON file, with the parameters of the paper's Table 3 or of the authors' implementation.
+    """Goals of the graph of a JSON file, of the paper's Table 3 or the authors' implementation.
 
     Args:
         config: the file, such as graph.json, which says all but the goal; or its content.
@@ -220,9 +218,9 @@ def from_graph(
         repeats: how often the whole sequence comes.
         seed: draws random goals and the shuffled order.
         num_frames: frames per block, or a list with those of each.
-        switch: None: a block for each task; else all tasks in one block, between which each row changes: in turns,
-            ``by_episode``; ``at_random``; or by ``drift`` from each task to the next.
-        switch_episodes: episodes between changes, in turns, in the mean, or of a drift.
+        switch: None: a block for each task; else one block, whose rows change task in turns, ``by_episode``;
+            ``at_random``; or by ``drift`` from each to the next.
+        switch_episodes: episodes between changes, on average for ``at_random``, or of a drift.
         name: of the curriculum, in logs and tables.
         goal_change: episodes after which each row draws another goal, a number or the fewest and the most; all tasks
             then share a block. None: as in the file.
@@ -252,13 +250,13 @@ def from_graph(
 
 
 def _several(value: object, usual: object = None) -> tuple[Any, ...]:
-    """Return a value or several of them as a tuple; the usual one for None."""
+    """Return one value or several as a tuple; the usual one for None."""
     listed = as_tuple(usual if value is None else value)
     return listed if isinstance(listed, tuple) else (listed,)
 
 
 def _shown(task: Task, ids: ReadOnlyValues) -> Observations:
-    """Return a task's observations with other ids of its states; None: unchanged."""
+    """Return a task's observations with other ids; None: unchanged."""
     shown = task.observations
     given = {name: value for name, value in ids.items() if value is not None}
     if not given:
@@ -270,7 +268,7 @@ def _shown(task: Task, ids: ReadOnlyValues) -> Observations:
 
 
 def _in_order(by_seed: Sequence[Tasks], goals: Any, num_goals: int, order: str, seed: int) -> Tasks:
-    """Return the graphs of each image seed with their goals, in one order."""
+    """Return each image seed's graphs with their goals, in one order."""
     require(*one_of(ORDERS, order=order), *at_least_one(num_goals=num_goals))
     depths = {graph.graph.depth for graph in by_seed[0]}
     given = goals
@@ -310,7 +308,7 @@ def _curriculum(
     switch_episodes: int,
     goal_change: int | Sequence[int] | None,
 ) -> Curriculum:
-    """Return tasks as blocks, or in one block where rows change between them or draw their goals."""
+    """Return tasks as blocks, or in one block with a switch or changing goals."""
     known = switch is None or switch in SWITCHES
     require(
         *at_least_one(repeats=repeats),

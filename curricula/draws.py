@@ -1,8 +1,4 @@
-"""Random draws from a seed through ``random.Random(seed).random()``.
-
-It is the one method whose numbers Python guarantees not to change between versions; no global generator is read or
-disturbed.
-"""
+"""Random draws through ``random.Random(seed).random()``, whose numbers Python keeps between versions."""
 
 from __future__ import annotations
 
@@ -16,18 +12,18 @@ Item = TypeVar("Item")
 
 
 def generator(seed: int) -> random.Random:
-    """Return the generator of a seed, an integer >= 0."""
+    """Return the generator of a seed >= 0."""
     require((is_int(seed, 0), f"seed must be an integer >= 0, got {seed!r}"))
     return random.Random(seed)
 
 
 def below(source: random.Random, count: int) -> int:
-    """Draw an integer in [0, count); for the small counts here, uniform to within 2**-36."""
+    """Draw an integer in [0, count); for small counts uniform to within 2**-36."""
     return int(source.random() * count)
 
 
 def shuffled(items: Iterable[Item], seed: int) -> list[Item]:
-    """Return the items in an order drawn uniformly from a seed."""
+    """Return the items in a uniformly random order."""
     order = list(items)
     source = generator(seed)
     for i in range(len(order) - 1, 0, -1):

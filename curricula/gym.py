@@ -22,10 +22,10 @@ MAPS = {
     "right": ("SFFF", "FHFH", "FFFG", "HFFF"),
     "below": ("SFFF", "FHFF", "FFFH", "HGFF"),
 }
-"""Lakes of 4 x 4 fields: start, frozen, hole and goal. Their goals are in two places."""
+"""4 x 4 fields of start, frozen, hole and goal; the goals are in two places."""
 
 LENGTHS = (0.25, 0.5, 1.0)
-"""Half the length of a pole; Gymnasium's own is 0.5."""
+"""Half-lengths of poles; Gymnasium's is 0.5."""
 
 POLE = "CartPoleOfLength-v0"
 
@@ -37,7 +37,7 @@ class CartPoleOfLength(CartPoleEnv):
 
     Args:
         half_length: half the length of the pole, in metres, > 0.
-        settings: the arguments of Gymnasium's.
+        settings: as Gymnasium's.
     """
 
     def __init__(self, half_length: float = 0.5, **settings: Any) -> None:
@@ -58,7 +58,7 @@ def frozen_lake_4maps(num_frames: int = 20_480) -> Curriculum:
     """Gymnasium's FrozenLake: two maps, each first without and then with slippery ice; the optimum is known.
 
     Args:
-        num_frames: frames of each of the four blocks.
+        num_frames: frames per block.
     """
     tasks = [
         GymTask(
@@ -76,7 +76,7 @@ def cartpole_3lengths(num_frames: int = 51_200) -> Curriculum:
     """Gymnasium's CartPole with poles of three lengths; an episode ends after 200 steps at the latest.
 
     Args:
-        num_frames: frames of each of the three blocks.
+        num_frames: frames per block.
     """
     tasks = [
         GymTask(f"curricula.gym:{POLE}", {"half_length": length}, label=f"length{length:g}", return_range=(1.0, 200.0))
@@ -89,7 +89,7 @@ def minigrid_3tasks(num_frames: int = 102_400) -> Curriculum:
     """Three tasks of MiniGrid from its images of 7 x 7 fields; needs the extra ``minigrid``.
 
     Args:
-        num_frames: frames of each of the three blocks.
+        num_frames: frames per block.
 
     Raises:
         ValueError: if MiniGrid is not installed.
@@ -102,7 +102,6 @@ def minigrid_3tasks(num_frames: int = 102_400) -> Curriculum:
 
 
 NEEDS = {"minigrid_3tasks": "minigrid"}
-"""The packages of extras that curricula need."""
+"""Packages of extras by curriculum."""
 
 NAMED = by_name(frozen_lake_4maps, cartpole_3lengths, minigrid_3tasks)
-"""Curricula by name."""

@@ -3,13 +3,13 @@
 Modulating masks (Ben-Iwhiwhu et al. 2023, TMLR, arXiv 2212.11110), repository dlpbc/mask-lrl, which has no results. PPO
 had 4 workers x 128 steps; 10 greedy episodes of all tasks were evaluated every 5,120 frames. MaskSC and AMSC ("Lifelong
 Context-Aware Retrieval and Composition for Scalable Knowledge Reuse", 2026), LRL-Baselines (2026), MOSAIC (Nath et al.
-2025, arXiv 2506.05577) and its predecessor; repositories under github.com/DMIU-ShELL. The learner sees a one-hot task
-id, the number of the task among all goals of some environments; the launcher of AMSC hides it.
+2025, arXiv 2506.05577) and its predecessor: repositories under github.com/DMIU-ShELL. The learner sees a one-hot task
+id, the task's number among all goals of some environments; the launcher of AMSC hides it.
 
-A family is one image seed and one path; its task at depth d has the first d decisions of the path. The fourth family
-exists twice: consistent, or skipping depth 5, so that its tasks have the depths 2, 3, 4, 6, 7, 8 and 9 in the groups of
-depth 2 to 8. Curricula with the latter are named ``..._skips_d5``. Single agents had 51,200 frames a task in the
-launchers of nested goals, where the scripts' default is 102,400.
+A family is one image seed and one path; its task at depth d has the path's first d decisions. The fourth family exists
+twice: consistent, or skipping depth 5, with depths 2, 3, 4, 6, 7, 8 and 9 in the groups of depth 2 to 8, named
+``..._skips_d5``. Single agents had 51,200 frames a task in the launchers of nested goals; the scripts' default is
+102,400.
 """
 
 from __future__ import annotations
@@ -32,27 +32,27 @@ MOSAIC = "Nath et al. 2025, arXiv 2506.05577; github.com/DMIU-ShELL/MOSAIC"
 L2D2C = "github.com/DMIU-ShELL/L2D2-C"
 
 MOST_DEPTH = 16
-"""Beyond it the image set of `single_task` takes gigabytes."""
+"""Beyond it the images of `single_task` take gigabytes."""
 
 PATHS = {1: "01011010010101", 2: "11010101101110", 3: "00100110", 4: "10011100"}
-"""The consistent families; the first two go down to depth 14."""
+"""The consistent families."""
 
 SEED_SETS = {1: (1, 2, 3, 4), 2: (3, 4, 5, 6), 3: (5, 6, 7, 8), 4: (7, 8, 9, 10), 5: (9, 10, 11, 12)}
-"""The image seeds of the four families in each set of files."""
+"""The families' image seeds in each set of files."""
 
 FAMILIES = tuple(product(PATHS, range(2, 12)))
-"""The environments of all nested goals, whose goals have the task ids."""
+"""The environments whose goals have the task ids."""
 
 DEPTH_3 = ((1, 3),)
 
 
 def ladder(family: int, deepest: int = 8) -> NamedTasks:
-    """Return the tasks of a family, depth 2 to the deepest."""
+    """Return a family's tasks, from depth 2 on."""
     return [(family, PATHS[family][:depth]) for depth in range(2, deepest + 1)]
 
 
 def in_turns(*families: NamedTasks) -> NamedTasks:
-    """Return at each depth one task of every family."""
+    """Return at each depth a task of every family."""
     return list(chain.from_iterable(zip(*families, strict=True)))
 
 
@@ -65,7 +65,7 @@ RANDOM_SKIPS_D5 = """3:001001 3:0010011 2:11010101 3:00100 1:01011 1:010 3:001 2
 
 
 class Listed(NamedTuple):
-    """A sequence of which only the frames can be changed."""
+    """A sequence of which only the frames change."""
 
     about: str
     source: str
@@ -179,13 +179,13 @@ def ct28_blocked_skips_d5(num_frames: int = 51_200, seed_set: int = 1) -> Curric
 def ct28_mosaic_skips_d5(num_frames: int = 102_400, seed_set: int = 1, agent: int | None = None) -> Curriculum:
     """CT28 of MOSAIC; its fourth family skips depth 5, an inconsistency.
 
-    There 28 agents that exchange what they know had one task each. It is unknown whether they saw task ids. Fifty
-    episodes evaluated a task; when is not known, and greedy actions are our choice.
+    There 28 agents that share knowledge had one task each. It is unknown whether they saw task ids and when 50 episodes
+    evaluated a task. Greedy actions are our choice.
 
     Args:
         num_frames: frames per task.
         seed_set: which of the five sets of image seeds, 1..5.
-        agent: the task of a single agent, 0..27; None: all tasks one after the other, which is ours.
+        agent: a single agent's task, 0..27; None: all tasks in turn, which is ours.
     """
     tasks = _of_agent(BLOCKED_SKIPS_D5, agent)
     evaluation = Evaluation(num_episodes=50)
@@ -195,12 +195,12 @@ def ct28_mosaic_skips_d5(num_frames: int = 102_400, seed_set: int = 1, agent: in
 def ct20(num_frames: int = 102_400, agent: int | None = None) -> Curriculum:
     """CT20: two families with nested goals, depth 2 to 11, one after the other.
 
-    Twenty agents that exchange what they know had one task each. Which of several files the published results used is
-    not known; this is the one with 20 tasks. Nor is known when and how long tasks were evaluated: our defaults.
+    Twenty agents that share knowledge had one task each. Of several files this is the one with 20 tasks; which one the
+    results used is unknown. The evaluation is our default.
 
     Args:
         num_frames: frames per task.
-        agent: the task of a single agent, 0..19; None: all tasks one after the other, which is ours.
+        agent: a single agent's task, 0..19; None: all tasks in turn, which is ours.
     """
     return _two_ladders("ct20", L2D2C, 11, num_frames, agent)
 
@@ -209,11 +209,11 @@ def mosaic_ladder(num_frames: int = 102_400, agent: int | None = None) -> Curric
     """The ladders of MOSAIC: two families with nested goals, depth 2 to 14, one after the other.
 
     Two files, ct14_md_seed1 and ct14_md_seed2, hold the 13 tasks of a family each. The frames are those of MOSAIC's 28
-    tasks; when and how long tasks were evaluated is not known: our defaults.
+    tasks; the evaluation is our default.
 
     Args:
         num_frames: frames per task.
-        agent: the task of a single agent, 0..25; None: all tasks one after the other, which is ours.
+        agent: a single agent's task, 0..25; None: all tasks in turn, which is ours.
     """
     return _two_ladders("mosaic_ladder", MOSAIC, 14, num_frames, agent)
 
@@ -237,7 +237,7 @@ def _curriculum(
     seed_set: int = 1,
     evaluation: Evaluation = MASK_EVALUATION,
 ) -> Curriculum:
-    """Return tasks with the images, the ids and the length of ids that the files of a set of image seeds have."""
+    """Return tasks with the images and ids of a set of image seeds."""
     require((seed_set in SEED_SETS, f"seed_set must be one of {', '.join(map(str, SEED_SETS))}, got {seed_set!r}"))
     seeds = SEED_SETS[seed_set]
     tasks = tuple(one_wait_image(path, seeds[family - 1]) for family, path in named)
@@ -252,4 +252,3 @@ def _curriculum(
 NAMED = {name: _listed(name, row) for name, row in LISTED.items()} | by_name(
     single_task, ct28_blocked_skips_d5, ct28_mosaic_skips_d5, ct20, mosaic_ladder
 )
-"""The curricula of this module by name."""

@@ -1,7 +1,7 @@
 """Tasks that compare memories: confounding graphs with long waits, after Ladosz et al. 2021.
 
-Their graph was not published. Section 4.2 of Soltoggio et al. 2023 says that the most complex one had p = 0.9 and 500
-observations; whether decision states had their own images is not known, so it is an argument here.
+Their graph was not published. By section 4.2 of Soltoggio et al. 2023 the most complex one had p = 0.9 and 500
+observations. It is unknown whether decisions had their own images: an argument says it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from curricula.axes import sequence
 SOURCE = "Ladosz et al. 2021; the numbers of its graph in Soltoggio et al. 2023, arXiv 2302.10887"
 
 MOST_DEPTH = 16
-"""A goal at random is one end state of 2^d."""
 
 
 def co_hard(
@@ -35,16 +34,16 @@ def co_hard(
 ) -> Curriculum:
     """One confounding graph, b=2, whose goal is reached by turns in alternation: 1, 2, 1, 2, ...
 
-    With shared decision images a policy must remember its decisions to reach this goal; with unique ones it need not,
-    and only must find out which decision was right, with waits in between that say nothing.
+    With shared decision images a policy must remember its decisions. With unique ones it only must find out which
+    decision was right, despite waits that say nothing.
 
     Args:
         depth: d.
         wait_prob: p, in [0, 1).
         expected_length: E[rho], the mean steps of an episode without fail, which then decides p; None: p is given.
         unique_decisions: whether each decision state has its own image; False: all show one image.
-        num_wait_images: images that wait states draw from at every observation; 1 is a surjective graph.
-        read_noise: largest addition to each pixel whenever an image is read, in 0..255.
+        num_wait_images: images that wait states draw from; 1 is a surjective graph.
+        read_noise: largest addition to a pixel on each read, in 0..255.
         num_frames: frames to learn from.
         image_seed: seed of the image set.
     """
@@ -69,7 +68,7 @@ def co_hard(
 
 
 def _with_unique_decisions(observations: Observations, count: int) -> Observations:
-    """Return observations with an image for each decision state; the ids of waits and ends move up to make room."""
+    """Return observations with an id per decision state; later ids move up."""
     more = count - 1
     first, last = observations.decision_ids
     wait, last_wait = observations.wait_ids
@@ -85,4 +84,3 @@ def _with_unique_decisions(observations: Observations, count: int) -> Observatio
 
 
 NAMED = {"co_hard": co_hard}
-"""The curricula of this module by name."""

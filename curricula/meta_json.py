@@ -1,11 +1,10 @@
 """Curricula from the JSON files of the labs: a list of environments, and which of their goals in which order.
 
-The labs' wrappers number all goals of all environments and choose by number. ``config_paths`` names the environment
-files, relative to the folder of the file and within it; ``task_order`` puts their goals one environment after the other
-(``default``) or in turns (``interleaved``); ``filter_tasks`` chooses from that list, in its own order, repeats allowed;
-``num_tasks`` cuts what is chosen. The one-hot label of a task has length ``label_dim`` and is its number in the whole
-list, or, by ``task_label_mode``, its place in the curriculum (``curriculum_index``) or what ``task_label_ids`` says
-(``explicit``).
+The labs' wrappers number all goals of all environments. ``config_paths`` names the environment files, relative to and
+within the file's folder; ``task_order`` puts their goals one environment after the other (``default``) or in turns
+(``interleaved``); ``filter_tasks`` chooses from that list, in its order, repeats allowed; ``num_tasks`` cuts the
+choice. A task's one-hot label has length ``label_dim`` and is its number in the whole list, or, by ``task_label_mode``,
+its place in the curriculum (``curriculum_index``) or what ``task_label_ids`` says (``explicit``).
 """
 
 from __future__ import annotations
@@ -40,20 +39,19 @@ LABEL_MODES = ("global_task_id", "curriculum_index", "explicit")
 
 @takes_numbers
 def from_meta_json(path: str | PathLike[str], num_frames: int | Sequence[int], name: str | None = None) -> Curriculum:
-    """The curriculum that a meta-JSON file describes, on environments as the authors' implementation has them.
+    """The curriculum of a meta-JSON file, on environments of the authors' implementation.
 
-    The learner sees the labels as one-hot task ids; how performance is measured is our default, as the files have
-    neither that nor budgets. ``dataclasses.replace(curriculum, protocol=Protocol())`` hides the labels.
+    The learner sees the labels as one-hot task ids; the evaluation is our default. ``dataclasses.replace(curriculum,
+    protocol=Protocol())`` hides the labels.
 
     Args:
         path: the meta-JSON file; its environment files may have the keys of 2019, 2021 or 2023.
-        num_frames: frames per task, or a list with those of each.
+        num_frames: of every task, or a list with those of each.
         name: of the curriculum; None: that of the file.
 
     Raises:
-        ValueError: names file and key, for files that cannot be read, are too large or too deeply nested, keys that
-            are missing or unknown, numbers out of range, and what cannot be reproduced (the order ``random``, labels
-            that are not one-hot).
+        ValueError: names file and key: files unreadable, too large or too deeply nested, keys missing or unknown,
+            numbers out of range, and the order ``random`` or other labels than one-hot.
     """
     file = Path(path)
     meta = _read(file)
@@ -97,7 +95,7 @@ class Pool:
         self._takes_turns = order == "interleaved"
 
     def at(self, number: int) -> tuple[int, int]:
-        """Return the environment and the goal of a number; environments without a further goal lose their turn."""
+        """Return the environment and goal of a number; environments without a further goal lose their turn."""
         if not self._takes_turns:
             starts = [0, *accumulate(self._sizes)]
             config = bisect_right(starts, number) - 1
@@ -113,7 +111,7 @@ class Pool:
 
 
 def read_environment(path: Path) -> NamedValues:
-    """The arguments of `Task` for an environment file, its goal still missing."""
+    """The arguments of `Task`, without goal, for an environment file."""
     content = _read(path)
     with within(path):
         return read_task(content, ())

@@ -1,10 +1,10 @@
 """Curricula over the configurations of the CT-graph paper.
 
-Soltoggio et al. 2023 (arXiv 2302.10887). Sections 3.4 and 3.5 name ways in which tasks can differ: the location of the
-goal, the distribution of inputs, the shape of the graph, all three at once, and which features vary and which do not. A
-function here is one way, for the five baseline configurations: ``su_b1_4tasks`` is `goal_location` of CT-SU-B1, the
-paper's own example of four tasks. The depths 2, 3, 4, 5 in this order are those of section 4.2. Other orders, the
-numbers of frames and the sizes of variations are choices of this package.
+Soltoggio et al. 2023 (arXiv 2302.10887), sections 3.4 and 3.5: tasks differ in the location of the goal, the
+distribution of inputs, the shape of the graph, all three, and in which features vary. A function here is one way, for
+the five baseline configurations: ``su_b1_4tasks`` is `goal_location` of CT-SU-B1, the paper's example of four tasks.
+The depths 2, 3, 4, 5 are those of section 4.2. Other orders, frames and sizes of variations are choices of this
+package.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from curricula.axes import Tasks
 PAPER = "Soltoggio et al. 2023, arXiv 2302.10887"
 
 KINDS = {"fo_b1": "full", "fo_b2": "full", "su_b1": "surjective", "co_b1": "confounding", "posr_b1": "surjective"}
-"""The observability of each configuration; see `curricula.axes.observability`."""
+"""The observability of each configuration, a kind of `curricula.axes.observability`."""
 
 DEPTHS = (2, 3, 4, 5)
 DEEPEST_GOAL = (1, 2, 1, 2, 2)
@@ -36,10 +36,10 @@ NUM_VARIATIONS = 4
 FRAMES = 204_800
 
 READ_NOISE = 10
-"""Largest addition to a pixel when an image is read. The paper gives no amplitude: this is a choice of this package."""
+"""Largest addition to a pixel on each read; the paper gives no amplitude."""
 
 READ_ROTATION = 5
-"""Largest rotation when an image is read, in degrees; Table 3 of the paper has 0 or 5."""
+"""Largest rotation on each read, in degrees; Table 3 of the paper has 0 or 5."""
 
 VERSION_2 = [
     "posr_b1_4tasks",
@@ -55,17 +55,17 @@ VERSION_2 = [
     "posr_b1_new_decisions",
     "posr_b1_new_waits",
 ]
-"""What changed: CT-POSR-B1 had noise in its rewards, and a single goal needed no memory."""
+"""CT-POSR-B1 had noise in its rewards, and a single goal needed no memory."""
 
 MOST_DEPTH = 4
-"""Changing goals are all tasks of one batch and evaluated for whole trials, so deeper graphs are refused."""
+"""Changing goals are all tasks of one batch, evaluated for whole trials."""
 
 DISSIMILAR = {(2, 2): (1, 2), (3, 2): (3, 1), (2, 3): (2, 1, 2), (3, 3): (2, 3, 1)}
-"""Branching factor and depth of tasks that share nothing, each with its goal."""
+"""Branching factor, depth and goal of tasks that share nothing."""
 
 
 def configured(configuration: str, image_seed: int = 1) -> Task:
-    """The task of a configuration such as ``su_b1``, its goal at the first branches.
+    """The task of a configuration such as ``su_b1``, with the goal (1, 1, ...).
 
     Raises:
         ValueError: for an unknown configuration; lists the choices.
@@ -79,20 +79,20 @@ def configured(configuration: str, image_seed: int = 1) -> Task:
 def one_goal(configuration: str, image_seed: int = 1) -> Task:
     """The configuration's task for curricula with a single goal.
 
-    Where all decision states look alike the goal is (1, 2). Its two decisions differ, so a deterministic policy without
-    memory never reaches it. Elsewhere the goal is (1, 1, ...).
+    Where all decision states look alike the goal is (1, 2), which a deterministic policy without memory never reaches;
+    else it is (1, 1, ...).
     """
     task = configured(configuration, image_seed)
     return task if KINDS[configuration] == "full" else replace(task, goal=(1, 2))
 
 
 def goal_location(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
-    """All goals of one graph one after the other, in lexicographic order: does a new goal overwrite the old one?
+    """All goals of one graph in lexicographic order: does a new goal overwrite the old one?
 
     Args:
         configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
         num_frames: frames per task.
-        image_seed: seed of the image set that all tasks share.
+        image_seed: seed of the shared image set.
     """
     tasks = axes.all_goals(configured(configuration, image_seed))
     return _curriculum(f"{configuration}_{len(tasks)}tasks", tasks, num_frames)
@@ -107,13 +107,13 @@ def instances(
 ) -> Curriculum:
     """All goals of one graph whose images vary on every read: is a class of images recognised by its instances?
 
-    Section 2.4.1 of the paper: noise is added to an image and it is slightly rotated each time it is read. So no two
-    observations of a state are equal, and a table of observations does not solve the tasks.
+    Section 2.4.1 of the paper: each read adds noise and a slight rotation. No two observations of a state are equal, so
+    a table of observations does not solve the tasks.
 
     Args:
         configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
         num_frames: frames per task.
-        image_seed: seed of the image set that all tasks share.
+        image_seed: seed of the shared image set.
         read_noise: largest addition to each pixel, in 0..255.
         read_rotation: largest rotation in whole degrees, in 0..359.
     """
@@ -124,13 +124,13 @@ def instances(
 def depth_growth(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
     """Depth 2 to 5 with nested goals: is a path reused whose end is the way to the next goal?
 
-    The goal of the deepest graph is (1, 2, 1, 2, 2), and each shallower goal is the beginning of it. All graphs use
-    the deepest one's images, so that no image changes its role.
+    The deepest goal is (1, 2, 1, 2, 2), and each shallower goal begins it. All graphs use the deepest one's images, so
+    no image changes its role.
 
     Args:
         configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
         num_frames: frames per task.
-        image_seed: seed of the image set that all tasks share.
+        image_seed: seed of the shared image set.
     """
     task = configured(configuration, image_seed)
     deepest = axes.reshaped(task, replace(task.graph, depth=DEPTHS[-1]), KINDS[configuration], DEEPEST_GOAL)
@@ -151,9 +151,7 @@ def input_variation(configuration: str, num_frames: int = FRAMES, image_seed: in
 
 
 def uncorrelated(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
-    """Four tasks with nothing in common but the shape of the graph: each has its own goal and image set.
-
-    See `dissimilar` for tasks that differ in their shape, too.
+    """Four tasks with only the shape of the graph in common: each has its own goal and image set.
 
     Args:
         configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
@@ -169,8 +167,8 @@ def uncorrelated(configuration: str, num_frames: int = FRAMES, image_seed: int =
 def dissimilar(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
     """Four tasks that differ in the shape of the graph, in the images and in the goal: is nothing forgotten?
 
-    Section 3.4.1 of the paper: such tasks test a learner for catastrophic forgetting, and not for transfer. The shapes
-    (b, d) are (2, 2), (3, 2), (2, 3) and (3, 3).
+    Section 3.4.1 of the paper: such tasks test for catastrophic forgetting, not transfer. The shapes (b, d) are (2, 2),
+    (3, 2), (2, 3) and (3, 3).
 
     Args:
         configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1; gives the wait probability and what is observed.
@@ -188,12 +186,12 @@ def dissimilar(configuration: str, num_frames: int = FRAMES, image_seed: int = 1
 def new_decisions(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
     """One goal; decision states get new images with each task, all others keep theirs: variant features.
 
-    What was learned of wait states stays right. Only the new decision images have to be learned.
+    Only the new decision images have to be learned.
 
     Args:
         configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
         num_frames: frames per task.
-        image_seed: seed of the image set that all tasks share.
+        image_seed: seed of the shared image set.
     """
     return _with_new_images(configuration, "decision", num_frames, image_seed)
 
@@ -201,12 +199,12 @@ def new_decisions(configuration: str, num_frames: int = FRAMES, image_seed: int 
 def new_waits(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
     """One goal; wait states get new images with each task, all others keep theirs: variant features.
 
-    What was learned of decisions stays right. Only the new wait images have to be learned.
+    Only the new wait images have to be learned.
 
     Args:
         configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
         num_frames: frames per task.
-        image_seed: seed of the image set that all tasks share.
+        image_seed: seed of the shared image set.
     """
     return _with_new_images(configuration, "wait", num_frames, image_seed)
 
@@ -224,9 +222,9 @@ def similar_goals(name: str, depth: int, num_shared: int, num_frames: int = FRAM
     Args:
         name: of the curriculum.
         depth: d of the graph, with b=2 and p=0.
-        num_shared: how many first decisions all goals share, below d; the goals are 2^(d - num_shared).
+        num_shared: shared first decisions, below d; there are 2^(d - num_shared) goals.
         num_frames: frames per task.
-        image_seed: seed of the image set that all tasks share.
+        image_seed: seed of the shared image set.
     """
     task = axes.reshaped(ct_su_b1(image_seed=image_seed), CTGraph(2, depth), "surjective", DEEPEST_GOAL[:depth])
     return _curriculum(name, axes.goals_sharing(task, num_shared), num_frames)
@@ -235,15 +233,15 @@ def similar_goals(name: str, depth: int, num_shared: int, num_frames: int = FRAM
 def changing_goals(num_frames: int = FRAMES, depth: int = 2, image_seed: int = 1) -> Curriculum:
     """A surjective graph whose goal changes after as many episodes as it has end states: search, then repeat.
 
-    The changes are unannounced. Section 4.2 of the paper reports of Ben-Iwhiwhu et al. 2020 such graphs of depth 2 and
-    3, where RL^2 "failed to solve all tasks". A trial is n = 2^depth episodes with one goal. The best policy tries the
-    end states one after the other, so its success in episode i of a trial is min(1, i/n). Later goals are drawn
-    uniformly; rows begin with all equally.
+    Changes are unannounced. Section 4.2 of the paper reports such graphs of depth 2 and 3 (Ben-Iwhiwhu et al. 2020),
+    where RL^2 "failed to solve all tasks". A trial is n = 2^depth episodes with one goal. The best policy tries the end
+    states in turn, so it succeeds in episode i of a trial with probability min(1, i/n). Later goals are drawn
+    uniformly.
 
     Args:
         num_frames: frames of all rows together.
         depth: d of the graph, with b=2 and p=0; the paper's are 2 and 3.
-        image_seed: seed of the image set that all tasks share.
+        image_seed: seed of the shared image set.
     """
     require((is_int(depth, 1, MOST_DEPTH), f"depth must be an integer in 1..{MOST_DEPTH}, got {depth!r}"))
     n = 2**depth
@@ -259,15 +257,15 @@ def random_graphs(
     """A large set of random surjective graphs that share their images: which features are invariant?
 
     Section 3.5 of the paper: n graphs differ in branching factor (2 or 3), depth (2, 3 or 4), wait probability (0 or
-    0.5) and goal. All share the meaning of images, and waiting at wait states.
+    0.5) and goal, and share the meaning of images.
 
     Args:
         num_frames: frames per task.
-        image_seed: seed of the image set that all tasks share.
+        image_seed: seed of the shared image set.
         num_tasks: how many graphs, n.
         seed: draws the graphs, an integer >= 0.
-        held_out: graphs, fewer than n, that have a block each after one block of all others, which take turns by
-            episode; 0: each graph has its block.
+        held_out: graphs, fewer than n, each with a block after one block of all others, which take turns by episode; 0:
+            each graph has its block.
     """
     tasks = axes.random_tasks(num_tasks, seed, kinds=("surjective",), image_seeds=(image_seed,))
     curriculum = _curriculum("random_graphs", tasks, num_frames)
@@ -284,7 +282,7 @@ def fo_b2_gradient(num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
 
     Args:
         num_frames: frames per task.
-        image_seed: seed of the image set that all tasks share.
+        image_seed: seed of the shared image set.
     """
     task = replace(ct_fo_b2(image_seed=image_seed), reward_fn=Gradient())
     return _curriculum("fo_b2_gradient", axes.all_goals(task), num_frames)
@@ -295,7 +293,7 @@ def fo_b1_noisy(num_frames: int = FRAMES, image_seed: int = 1, reward_std: float
 
     Args:
         num_frames: frames per task.
-        image_seed: seed of the image set that all tasks share.
+        image_seed: seed of the shared image set.
         reward_std: standard deviation of what end states pay.
     """
     task = replace(ct_fo_b1(image_seed=image_seed), reward_std=reward_std)
@@ -309,7 +307,7 @@ def fo_b1_stochastic_rewards(num_frames: int = FRAMES, image_seed: int = 1, rewa
 
     Args:
         num_frames: frames per task.
-        image_seed: seed of the image set that all tasks share.
+        image_seed: seed of the shared image set.
         reward_std: standard deviation of what end states pay.
     """
     task = replace(ct_fo_b1(image_seed=image_seed), reward_fn=Gradient(), reward_std=reward_std)
@@ -321,13 +319,13 @@ def stochastic_grouped(
 ) -> Curriculum:
     """The four goals of a fully stochastic graph, b=2, d=2, p=0: all five kinds of states draw images from groups.
 
-    Each observation of a kind of state is one of its group's images, similar to each other and less so to others.
+    Images of a group are similar to each other and less so to others.
 
     Args:
         num_frames: frames per task.
-        image_seed: seed of the image set that all tasks share.
+        image_seed: seed of the shared image set.
         group_size: images of each kind of state.
-        within: expected distance of images of one group; see `GroupedImages`.
+        within: expected distance of images of one group.
         between: expected distance of images of different groups.
     """
     images = GroupedImages((group_size,) * 5, within, between, image_seed)
@@ -341,12 +339,12 @@ def stochastic_grouped(
 def co_hard_4tasks(num_frames: int = 1_024_000, image_seed: int = 1, num_wait_images: int = 500) -> Curriculum:
     """The four goals of a confounding graph with p=0.9 and 500 wait images, b=2 and d=2 as CT-CO-B1.
 
-    Section 4.2 of the paper says of Ladosz et al. 2021 that their most complex benchmark had p=0.9 and 500
-    observations. Their graph was not published: its other parameters are those of CT-CO-B1.
+    By section 4.2 of the paper the most complex benchmark of Ladosz et al. 2021 had p=0.9 and 500 observations; it was
+    not published.
 
     Args:
-        num_frames: frames per task; an episode without fail takes 33 frames in the mean.
-        image_seed: seed of the image set that all tasks share.
+        num_frames: frames per task; an episode without fail takes 33 on average.
+        image_seed: seed of the shared image set.
         num_wait_images: images that wait states draw from.
     """
     task = replace(ct_su_b1(image_seed=image_seed), graph=CTGraph(2, 2, 0.9))
@@ -385,4 +383,3 @@ NAMED = {
     "stochastic_grouped": stochastic_grouped,
     "co_hard_4tasks": co_hard_4tasks,
 }
-"""The curricula of this module by name."""

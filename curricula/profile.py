@@ -1,11 +1,9 @@
 """Curricula for the learning properties that the CT-graph paper lists, and how each property is scored.
 
-Section 1 of Soltoggio et al. 2023 (arXiv 2302.10887) lists the properties in this order. The tasks, the numbers of
-frames and the scores are choices of this package; ``docs/reference/profile.md`` says what a score means. All graphs
-have two branches. Tasks with different image seeds have different images.
-
-Goals come in sets in which each place has both branches equally often. Properties 5, 6 and 10 compare lives of a seed
-that end with the same block, `TARGETS`, and differ in what comes before it; `profile_fresh` has nothing before it.
+Section 1 of Soltoggio et al. 2023 (arXiv 2302.10887) lists the properties in this order. Tasks, frames and scores are
+choices of this package; ``docs/reference/profile.md`` explains them. All graphs have b=2, and image seeds differ where
+images do. In sets of goals each place has both branches equally often. Properties 5, 6 and 10 compare lives that end
+with the block `TARGETS` and differ in what comes before; `profile_fresh` has nothing before.
 """
 
 from __future__ import annotations
@@ -29,19 +27,19 @@ SOURCE = "ctgraph_rl, after section 1 of Soltoggio et al. 2023, arXiv 2302.10887
 VERSION = 2
 
 MIRRORED = {2: ((1, 2), (2, 1)), 3: ((1, 2, 1), (2, 1, 2)), 4: ((1, 2, 1, 2), (2, 1, 2, 1))}
-"""Goals by depth. No two decisions in a row are equal, so that a policy must know where it is."""
+"""Goals by depth without two equal decisions in a row, so that a policy must know where it is."""
 
 EIGHT = ((1, 1, 1, 1), (2, 2, 1, 2), (1, 2, 2, 1), (2, 1, 2, 2), (2, 1, 1, 1), (1, 2, 1, 2), (2, 2, 2, 1), (1, 1, 2, 2))
 """Goals of depth 4: each place has both branches four times."""
 
 SIMILAR = ((1, 1), (2, 2))
-"""Goals that share the first decision with those of `TARGETS`."""
+"""Goals that share the first decision with `TARGETS`."""
 
 DISSIMILAR = ((2, 1), (1, 2))
-"""Goals that share no decision with those of `TARGETS`."""
+"""Goals that share no decision with `TARGETS`."""
 
 CURVE = 12
-"""Evaluations of a block whose area counts; without chance in a task, all episodes of a greedy policy are the same."""
+"""Evaluations of a block whose area counts; one greedy episode each suffices without chance."""
 
 
 def profile_observability(num_frames: int = 819_200) -> Curriculum:
@@ -62,7 +60,7 @@ def profile_observability(num_frames: int = 819_200) -> Curriculum:
 
 
 def profile_memory(num_frames: int = 614_400) -> Curriculum:
-    """Property 2: sequences of growing length, all at once, whose goals need memory; first rewards are guided.
+    """Property 2: goals of growing depth that need memory, all at once; first rewards are guided.
 
     Args:
         num_frames: frames of the eight tasks together.
@@ -78,10 +76,10 @@ def profile_memory(num_frames: int = 614_400) -> Curriculum:
 def profile_sparsity(num_frames: int = 57_344) -> Curriculum:
     """Property 3: fully observable goals whose reward random actions rarely meet, the rarest first.
 
-    Each graph has two goals, one after the other on the same images, so that no sequence of actions reaches both.
+    Each graph has two goals in turn on the same images, so no sequence of actions reaches both.
 
     Args:
-        num_frames: frames of each of the six goals.
+        num_frames: frames of each goal.
     """
     tasks: list[Task] = []
     for depth in (7, 6, 5):
@@ -90,7 +88,7 @@ def profile_sparsity(num_frames: int = 57_344) -> Curriculum:
 
 
 def profile_adaptation(num_frames: int = 40_960) -> Curriculum:
-    """Property 4: eight goals of a fully observable graph of depth 4, one after the other.
+    """Property 4: eight goals of a fully observable graph of depth 4 in turn.
 
     Args:
         num_frames: frames of each goal, a multiple of 5.
@@ -176,7 +174,7 @@ def profile_model(num_frames: int = 98_304) -> Curriculum:
     """Property 9: a surjective graph with random waits; what comes next depends on the decisions so far.
 
     Args:
-        num_frames: frames that the agent learns from before.
+        num_frames: frames to learn from before.
     """
     task = ct_graph(2, 2, 0.5, (1, 2), fully_observable=False)
     return _profile("model", [task], num_frames, Evaluation(before=False))
@@ -196,8 +194,8 @@ def profile_innate(num_frames: int = 98_304) -> Curriculum:
 def profile_roles(num_frames: int = 98_304) -> Curriculum:
     """Control of property 10: as `profile_innate`, but before its last block each image stands for another state.
 
-    Images change their roles before the last block: those of wait states were shown by decision and end states, and the
-    other way round. An agent that is slow wherever images are new is not slow here.
+    Images of wait states were shown by decision and end states before, and the other way round. An agent that is slow
+    only where images are new is not slow here.
 
     Args:
         num_frames: frames of the last goals together, a multiple of 24.
@@ -210,7 +208,7 @@ def profile_roles(num_frames: int = 98_304) -> Curriculum:
 
 
 def _life(name: str, before: Sequence[Task], num_frames: int) -> Curriculum:
-    """Return a block of half as many frames as the last one, if there is anything before, and that of `TARGETS`."""
+    """Return a block of half the frames for the tasks before, if any, and the block of `TARGETS`."""
     evaluation = Evaluation(10, before=False, every=num_frames // CURVE)
     if not before:
         return _profile(name, [TARGETS], num_frames, evaluation)
@@ -222,12 +220,12 @@ def _on_graphs(goals: Sequence[tuple[int, ...]], image_seeds: Sequence[int] = (1
 
 
 def _first_decisions(image_seeds: Sequence[int]) -> tuple[Task, ...]:
-    """Return the goals of `TARGETS` as far as their first decision, on images of some seeds."""
+    """Return the first decisions of `TARGETS` as goals, on images of some seeds."""
     return growing_depth(_on_graphs(MIRRORED[2], image_seeds), [1])
 
 
 def _relatives() -> list[Task]:
-    """Return graphs with the images of `TARGETS`, whose goals have another first decision."""
+    """Return graphs with the images of `TARGETS` and another first decision."""
     tasks: list[Task] = []
     for deep in _on_graphs(DISSIMILAR):
         tasks += [*growing_depth(deep, [1]), replace(deep, graph=replace(deep.graph, wait_prob=0.5))]
@@ -235,11 +233,11 @@ def _relatives() -> list[Task]:
 
 
 TARGETS = _on_graphs(MIRRORED[2])
-"""The last block of the lives that properties 5, 6 and 10 compare."""
+"""The last block of compared lives."""
 
 
 def _alternating(first: int, depth: int) -> tuple[int, ...]:
-    """The goal 1, 2, 1, 2, ... or 2, 1, 2, 1, ..."""
+    """The goal 1, 2, 1, ... or 2, 1, 2, ..."""
     return tuple(first if place % 2 == 0 else 3 - first for place in range(depth))
 
 
@@ -254,7 +252,7 @@ def _profile(
 
 
 class Property(NamedTuple):
-    """A property: its name in figures, and the measure of `ctgraph_rl.profile.properties` with its arguments."""
+    """A property: its name in figures, and its measure of `ctgraph_rl.profile.properties`."""
 
     title: str
     measure: str
@@ -263,7 +261,7 @@ class Property(NamedTuple):
 
 
 AFRESH = ("profile_fresh", "profile_unrelated")
-"""Controls of what an agent reuses: nothing before, and as long a history that shares nothing."""
+"""Controls of reuse: nothing before, and as long a history that shares nothing."""
 
 PROPERTIES = {
     "profile_observability": Property("observability", "above_ceilings", {"sizes": (2, 2, 2, 2)}),
@@ -279,7 +277,7 @@ PROPERTIES = {
         "innate knowledge", "gains", {}, ("profile_fresh", "profile_unrelated", "profile_roles")
     ),
 }
-"""The properties in the order of the paper, by their curricula."""
+"""In the paper's order, by curricula."""
 
 NAMED = by_name(
     profile_observability,
@@ -297,4 +295,3 @@ NAMED = by_name(
     profile_dissimilar,
     profile_roles,
 )
-"""The curricula of this module by name."""

@@ -1,8 +1,7 @@
 """Common parts of the published sequences: the labs' environments, task ids and evaluation; and those lost.
 
 The labs write a goal as a string of 0 and 1, and a task with its image seed before it: ``2:110`` is the goal (2, 2, 1)
-with the images of seed 2. Environments are those of the authors' implementation, its switches on, as
-`Task.from_json` reads their files.
+with the images of seed 2. Environments are as `Task.from_json` reads their files.
 """
 
 from __future__ import annotations
@@ -17,15 +16,15 @@ from ctgraph_rl.tasks.task import Task
 from curricula.axes import Tasks, sequence
 
 NamedTasks = list[tuple[int, str]]
-"""Tasks as the labs write them: image seed, and path."""
+"""Tasks as image seed and path."""
 
 GoalPool = Sequence[tuple[int, int]]
-"""(image seed, depth) of each environment whose goals the labs number one after the other."""
+"""(image seed, depth) of each environment, whose goals are numbered in turn."""
 
 MASK_EVALUATION = Evaluation(num_episodes=10, greedy=True, every=5120)
 """Ten greedy episodes of all tasks every 5,120 frames (10 iterations of 4 workers x 128 steps).
 
-That is the protocol of the modulating-masks code and of those built on it. The evaluation before training is ours.
+The modulating-masks code and its successors have this protocol. The evaluation before training is ours.
 """
 
 
@@ -39,9 +38,9 @@ def environment(
     unique: tuple[bool, bool] = (True, True),
     one_hot: bool = False,
 ) -> NamedValues:
-    """A configuration file as the labs have them: b=2, p=0, one goal, reward 1, no noise; ids are consecutive.
+    """A file as the labs have them: b=2, p=0, one goal, reward 1, no noise, consecutive ids.
 
-    ``unique`` says whether decision states and wait states have their own images.
+    ``unique``: decision states, and wait states, have their own images.
     """
     return {
         "graph_shape": {"d": depth, "b": 2, "p": 0.0},
@@ -71,19 +70,19 @@ def environment(
 
 
 def goal_of(path: str) -> tuple[int, ...]:
-    """A goal as the labs write it, ``011``, as decisions: (1, 2, 2)."""
+    """The goal of a path: ``011`` as (1, 2, 2)."""
     return tuple(int(branch) + 1 for branch in path)
 
 
 def one_wait_image(path: str, image_seed: int) -> Task:
-    """A task of the labs' ``pomdp_wait`` environments: one image for all wait states, one for each other state."""
+    """A task of the ``pomdp_wait`` environments: one image for all wait states, one for each other state."""
     n = 2 ** len(path)
     config = environment(len(path), (2, 2), (3, n + 1), (n + 2, 2 * n + 1), image_seed, unique=(True, False))
     return Task.from_json(config, goal_of(path))
 
 
 def full_mdp(path: str, image_seed: int, fail_reward: float = 0.0, one_hot: bool = False) -> Task:
-    """A task of the labs' fully observable environments: an image, or a vector, for each state."""
+    """A task of the fully observable environments: an image, or a vector, per state."""
     n = 2 ** len(path)
     ids = (2, 2 * n), (2 * n + 1, 3 * n - 1), (3 * n, 4 * n - 1)
     return Task.from_json(environment(len(path), *ids, image_seed, fail_reward, one_hot=one_hot), goal_of(path))
@@ -114,14 +113,14 @@ def labelled(
     num_frames: int,
     evaluation: Evaluation = MASK_EVALUATION,
 ) -> Curriculum:
-    """A block for each task, announced, with a one-hot task id of length ``num_task_ids``; a task may come again."""
+    """An announced block for each task, with one-hot task ids of length ``num_task_ids``; tasks may repeat."""
     by_task = one_id_each(tasks, ids)
     protocol = Protocol("one_hot", num_task_ids=num_task_ids, task_ids=tuple(by_task.values()))
     return sequence(name, tasks, num_frames, source=source, protocol=protocol, evaluation=evaluation)
 
 
 def one_id_each(tasks: Tasks, ids: Sequence[int]) -> Mapping[Task, int]:
-    """The id of each different task, in the order of first appearance.
+    """The id of each task, by first appearance.
 
     Raises:
         ValueError: for a task with two ids.
@@ -135,7 +134,7 @@ def one_id_each(tasks: Tasks, ids: Sequence[int]) -> Mapping[Task, int]:
 
 
 def chosen(what: str, number: int, choices: Sequence[Any]) -> Any:
-    """The choice of a number counted from 0.
+    """The choice of a number from 0.
 
     Raises:
         ValueError: for a number that does not exist.
@@ -145,7 +144,7 @@ def chosen(what: str, number: int, choices: Sequence[Any]) -> Any:
 
 
 class Missing(NamedTuple):
-    """A published experiment, or a part of one, that no curriculum stands for."""
+    """A published experiment, or part of one, without a curriculum."""
 
     name: str
     what: str
@@ -207,4 +206,4 @@ MISSING = (
         "they were drawn again in every generation; penn_a_swap draws by the same rule from another seed",
     ),
 )
-"""Sequences that cannot be recovered, and why; nothing here is guessed."""
+"""Sequences that cannot be recovered, and why."""

@@ -1,9 +1,8 @@
-"""The sequences of L2D2-C: agents that learn the same tasks in different orders and exchange what they know.
+"""The sequences of L2D2-C: agents that learn the same tasks in different orders and share knowledge.
 
 Nath et al. 2023 (CoLLAs), repository DMIU-ShELL/L2D2-C. Fully observable graphs of depth 2; a task is an image seed and
-one of four goals, and its id counts both: 4 (seed - 1) + goal. A separate agent evaluated 25 episodes; when, and
-whether actions were greedy, is not known: block ends and greedy actions are our choice. It is also unknown whether
-agents saw the task ids of the files.
+one of four goals, and its id is 4 (seed - 1) + goal. A separate agent evaluated 25 episodes. It is unknown when,
+whether greedily, and whether agents saw task ids: block ends and greedy actions are our choice.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ CT16_ORDERS = """
 4 3 13 14 12 8 10 5 11 15 7 2 0 6 9 1
 13 4 1 10 15 2 0 8 11 7 12 5 3 14 6 9
 """
-"""The tasks of agents 0 to 18 in order."""
+"""The tasks of agents 0 to 18."""
 
 
 def ct16(num_frames: int = 51_200, agent: int = 0) -> Curriculum:
@@ -78,18 +77,18 @@ c5f44033053dd5d51aa3a047a338423f6353aa4c9fcb933d4e10f75f9bd80b44
 e18b8a73314d81e388265fdfe8c330a6742dfbcb2cbb6506be2c383596d58c64
 d78b1d05eb211c7f6bcb75973a618ca08c4d37231409210da53c44dc48b6a552
 """
-"""The tasks of agents 1 to 12 in order, a hexadecimal digit each."""
+"""The tasks of agents 1 to 12, a hexadecimal digit each."""
 
 
 def ct16_64(num_frames: int | None = None, agent: int = 1, in_order: bool = False) -> Curriculum:
     """CT16_64: 64 short blocks of the 16 tasks of CT16, each agent in its published order.
 
-    Agents 0 and 13 learn each task once, in the order of the ids, for four times as many frames.
+    Agents 0 and 13 learn each task once, in the order of the ids, for four times the frames.
 
     Args:
         num_frames: frames per block; None: what the agent had, 12,800, or 51,200 for agents 0 and 13.
         agent: whose order, 0..13.
-        in_order: agent 1 learns the tasks in the order of the ids, four times over, as in the second published file.
+        in_order: agent 1 learns in the order of the ids, four times, as in the second published file.
     """
     once = "0123456789abcdef"
     orders = [once, *CT16_64_ORDERS.split(), once]
@@ -101,7 +100,7 @@ def ct16_64(num_frames: int | None = None, agent: int = 1, in_order: bool = Fals
 
 
 class Rotations(NamedTuple):
-    """Agents that learn tasks 0, 1, .. in orders rotated to the right."""
+    """Agents that learn tasks 0, 1, ... in orders rotated to the right."""
 
     places: tuple[int, ...]  # by how many places for each agent
     num_frames: tuple[int, ...]  # of each agent
@@ -115,14 +114,13 @@ ROTATIONS = {
     16: Rotations((0, *range(16)), (12_800,) * 17, 16),
     32: Rotations((0,) * 39, (40_960,) * 39, 32),
 }
-"""All 39 agents of 32 x 32 have one order. The settings say 40,960 frames; a copy in the logs says 25,600. The length
-of its task ids is not known; 32 is our choice."""
+"""32 x 32: all 39 agents have one order, settings say 40,960 frames, logs 25,600; ids of length 32 are our choice."""
 
 
 def rotated(num_tasks: int, num_frames: int | None = None, agent: int = 0) -> Curriculum:
-    """The first image seeds' tasks in the order of the ids, rotated to the right by a number of places for each agent.
+    """The first image seeds' tasks in the order of the ids, rotated to the right by each agent's places.
 
-    Several versions of the files are public; others have other budgets.
+    Other public versions of the files have other budgets.
 
     Args:
         num_tasks: 2, 4, 8, 16 or 32.
@@ -149,4 +147,3 @@ NAMED = {
     "ct134": ct134,
     **{f"l2d2c_{num_tasks}x{num_tasks}": partial(rotated, num_tasks) for num_tasks in ROTATIONS},
 }
-"""The curricula of this module by name."""

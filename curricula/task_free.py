@@ -1,8 +1,8 @@
 """A task-free protocol: what can change without notice, in three curricula of the same four tasks.
 
 Task-free continual learning (Zeno et al. 2018, arXiv 1803.10123; Aljundi et al. 2019, arXiv 1812.03596) gives a learner
-neither ids nor boundaries. Change points are known here to those who measure, so that delays and false alarms of a
-detector can be counted; the learner observes none. The graph is that of CT-FO-B1, so that no task needs memory.
+neither ids nor boundaries. The change points are known to those who measure a detector's delays and false alarms. The
+graph is that of CT-FO-B1, so no task needs memory.
 """
 
 from __future__ import annotations
@@ -26,17 +26,16 @@ DIFFER = ("goals", "inputs", "both")
 """What changes from task to task."""
 
 ROUNDS = ((0, 1, 2, 3), (1, 3, 0, 2), (3, 1, 2, 0))
-"""Each task once in a round, and none twice in a row."""
+"""Each task once per round, none twice in a row."""
 
 LONGEST_EPISODE = 7
-"""Steps of an optimal episode of CT-FO-B1."""
+"""Steps of an optimal episode."""
 
 
 def task_free_abrupt(num_frames: int = 102_400, differ: str = "goals", image_seed: int = 1) -> Curriculum:
     """Four tasks, one after the other, without notice: changes are abrupt, at known frames.
 
-    They differ in ``goals``, the four of the graph behind the same images; in ``inputs``, four image sets and one goal;
-    or in ``both``, an image set for each goal.
+    They differ in ``goals``, on the same images; in ``inputs``, four image sets with one goal; or in ``both``.
 
     Args:
         num_frames: frames per task.
@@ -51,8 +50,8 @@ def task_free_gradual(
 ) -> Curriculum:
     """Four tasks, with a gradual change from each to the next, as long as a stay: there is no point of change.
 
-    Within a change each environment plays, from episode to episode, the next task with a probability that rises from 0
-    to 1 by the time that the longest episodes take.
+    Within a change each episode has the next task with a probability that rises from 0 to 1 by the time that the
+    longest episodes take.
 
     Args:
         num_frames: frames of each stay, and of each change.
@@ -97,4 +96,3 @@ def _tasks(differ: str, image_seed: int) -> list[Task]:
 
 
 NAMED = by_name(task_free_abrupt, task_free_gradual, task_free_recurring)
-"""The curricula of this module by name."""

@@ -21,7 +21,7 @@ from ctgraph_rl.tasks.paper_json import shown_ids
 from ctgraph_rl.tasks.task import Task
 
 OBSERVABILITY = ("full", "decisions", "surjective", "confounding")
-"""How much of its state a task shows; see `observations_of`."""
+"""How much of its state a task shows, as in `observations_of`."""
 
 
 @takes_numbers
@@ -41,10 +41,9 @@ def ct_graph(
         depth: d >= 1.
         wait_prob: p in [0, 1).
         goal: d decisions in 1..b, such as ``"1.2"``; None: always the first branch.
-        fully_observable: an image for each state, in the order home, fail, waits, decisions, ends; False: surjective,
-            the images 0 to 4 for home, fail, decision, wait and end states.
+        fully_observable: an image for each state; False: surjective, images 0 to 4 for home, fail, decision, wait and
+            end.
         one_hot: vectors instead of images.
-        image_seed: seed of the image set.
     """
     graph = CTGraph(branching_factor, depth, wait_prob)
     observations = observations_of(graph, "full" if fully_observable else "surjective")
@@ -58,13 +57,12 @@ def observations_of(graph: CTGraph, kind: str, num_wait_images: int = 100) -> Ob
     """Return observations with ids from 2 on: waits, decisions, ends where states have their own, else decisions first.
 
     Args:
-        graph: the tree.
         kind: ``full``, an id for each state; ``decisions``, as full but one id for all wait states; ``surjective``, one
             id for each kind of state; ``confounding``, as surjective but wait states draw one of several ids.
         num_wait_images: ids of wait states, for ``confounding``.
 
     Raises:
-        ValueError: for another kind, and no wait images.
+        ValueError: for an unknown kind, or no wait images.
     """
     require(
         (kind in OBSERVABILITY, f"kinds must be some of {', '.join(OBSERVABILITY)}, got {kind!r}"),
@@ -103,7 +101,6 @@ def ct_su_b1(goal: Goal = "1.1", image_seed: int = 1) -> Task:
 
     Args:
         goal: two decisions in 1..2, such as ``"1.2"``.
-        image_seed: seed of the image set.
 
     Example:
         >>> ct_su_b1(goal="2.1").memoryless_ceiling()
@@ -115,11 +112,10 @@ def ct_su_b1(goal: Goal = "1.1", image_seed: int = 1) -> Task:
 def ct_co_b1(goal: Goal = "1.1", image_seed: int = 1) -> Task:
     """CT-CO-B1: confounding, b=2, d=2, p=0; wait states draw one of a hundred images at every observation.
 
-    Decision states show image 2 and wait states the images 3 to 102: the paper's D_IDs=[2,2] and W_IDs=[3,102].
+    The paper's D_IDs=[2,2] and W_IDs=[3,102].
 
     Args:
         goal: two decisions in 1..2, such as ``"1.2"``.
-        image_seed: seed of the image set.
     """
     graph = CTGraph(2, 2, 0.0)
     shown = observations_of(graph, "confounding")
@@ -129,11 +125,10 @@ def ct_co_b1(goal: Goal = "1.1", image_seed: int = 1) -> Task:
 def ct_posr_b1(goal: Goal = "1.1", image_seed: int = 1) -> Task:
     """CT-POSR-B1: partially observable sparse reward, b=2, d=2, p=0.5; the images of CT-SU-B1.
 
-    The paper's D_IDs=[2,2] and W_IDs=[3,3]. Episodes have a variable length, and rewards have no noise.
+    The paper's D_IDs=[2,2] and W_IDs=[3,3]. Rewards have no noise.
 
     Args:
         goal: two decisions in 1..2, such as ``"1.2"``.
-        image_seed: seed of the image set.
     """
     return ct_graph(2, 2, 0.5, goal, fully_observable=False, image_seed=image_seed)
 
@@ -145,16 +140,12 @@ CONFIGURATIONS: dict[str, Callable[..., Task]] = {
     "CT-CO-B1": ct_co_b1,
     "CT-POSR-B1": ct_posr_b1,
 }
-"""The configurations of the paper by name."""
 
 Json = str | PathLike[str] | Mapping[str, Any]
 
 
 class UnknownFieldError(ValueError, TypeError):
-    """A keyword argument that names no field.
-
-    It is a ``TypeError``, too, as of any Python function: TorchRL's ``GymEnv`` tries without an argument refused so.
-    """
+    """A keyword argument that names no field; a ``TypeError`` so that TorchRL's ``GymEnv`` tries again without it."""
 
 
 @takes_numbers
@@ -190,7 +181,7 @@ def make_task(task: Task | str | None = None, config: Json | None = None, **chan
 
 
 def _changed(task: Task, changes: NamedValues) -> Task:
-    """A task with other values of its fields, those of its graph and its observations among them."""
+    """A task with other values of its fields, or of its graph's or observations'."""
     if "image_seed" in changes:
         require((task.image_seed is not None, f"image_seed needs generated images, got {task.images!r}"))
         changes["images"] = replace(task.images, seed=changes.pop("image_seed"))  # type: ignore[type-var]

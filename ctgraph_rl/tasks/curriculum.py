@@ -32,7 +32,7 @@ FINGERPRINT_SCHEMA = 1
 """Raised when the way a fingerprint is computed changes."""
 
 SHOWN = 20
-"""Blocks, and tasks of a block, that a notebook shows at most."""
+"""Most blocks, and tasks of a block, in a notebook."""
 
 
 @dataclass(frozen=True)
@@ -41,15 +41,12 @@ class Curriculum:
 
     Args:
         name: name that a paper cites.
-        version: raised when the content changes.
+        version: rises when the content changes.
         source: where the sequence comes from.
-        blocks: the blocks in order.
-        evaluation: how performance is measured.
-        protocol: what the learner observes of task ids and boundaries.
 
     Raises:
-        ValueError: for no blocks, an empty name, tasks that one environment cannot hold together, and a protocol or an
-            evaluation that does not fit the tasks.
+        ValueError: for no blocks, an empty name, tasks that one environment cannot hold, or an unfit protocol or
+            evaluation.
 
     Example:
         >>> from ctgraph_rl import Block, Evaluation
@@ -105,7 +102,6 @@ class Curriculum:
         return f"<Curriculum {self._summary}>"
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows: a table of the first blocks."""
         labels = dict(zip(self.tasks, self.labels, strict=True))
         rows = ["<tr><th>block</th><th>tasks</th><th>b, d, p</th><th>frames</th></tr>"]
         for number, block in enumerate(self.blocks[:SHOWN], 1):
@@ -125,7 +121,7 @@ class Curriculum:
 
     @cached_property
     def tasks(self) -> tuple[TaskLike, ...]:
-        """The different tasks, in the order of first appearance."""
+        """The different tasks, by first appearance."""
         return tuple(dict.fromkeys(task for block in self.blocks for task in block.tasks))
 
     @cached_property
@@ -135,15 +131,15 @@ class Curriculum:
 
     @cached_property
     def ends(self) -> tuple[int, ...]:
-        """Frames of the run at the end of each block."""
+        """Frames of the run at each block's end."""
         return tuple(accumulate(block.num_frames for block in self.blocks))
 
     def block_at(self, frames: int) -> int:
-        """The number of the block, from 1, that the last of the run's first ``frames`` frames is of; 0 for none."""
+        """The block, from 1, of the run's frame number ``frames``; 0 for none."""
         return bisect_left(self.ends, frames) + 1 if frames else 0
 
     def is_end(self, frames: int) -> bool:
-        """Return whether a block ends after the run's first ``frames`` frames."""
+        """Return whether a block ends after ``frames`` frames."""
         block = self.block_at(frames)
         return block > 0 and block <= len(self.ends) and self.ends[block - 1] == frames
 
@@ -159,14 +155,14 @@ class Curriculum:
 
     @property
     def moments(self) -> tuple[int, ...]:
-        """All numbers of frames after which an evaluation is due."""
+        """All frames after which an evaluation is due."""
         every = self.evaluation.every
         within = range(every, self.num_frames + 1, every) if every else ()
         return tuple(filter(self.moment, sorted({0, *self.ends, *within})))
 
     @property
     def segments(self) -> tuple[tuple[Block, ...], ...]:
-        """The blocks between two announced boundaries: each separately, or all of them where boundaries are hidden."""
+        """The blocks between announced boundaries: each separately, or all where boundaries are hidden."""
         return tuple((block,) for block in self.blocks) if self.protocol.announces else (self.blocks,)
 
     @property
@@ -176,12 +172,12 @@ class Curriculum:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """A different short name for each of ``tasks``: the goal, or the first of its parts, and what else differs."""
+        """A short name for each of ``tasks``: the first of its parts, such as the goal, and what else differs."""
         return self.evaluated_labels[: len(self.tasks)]
 
     @cached_property
     def evaluated_labels(self) -> tuple[str, ...]:
-        """`labels`, and in the same manner those of the held-out tasks."""
+        """`labels`, then those of the held-out tasks."""
         parts = [task.label_parts for task in (*self.tasks, *self.evaluation.held_out)]
         first = next(iter(parts[0]))
         differing = []
@@ -199,7 +195,7 @@ class Curriculum:
 
     @cached_property
     def trained(self) -> tuple[tuple[int, ...], ...]:
-        """For each block, the positions in ``tasks`` of the tasks that it trains."""
+        """For each block, the positions of its tasks in ``tasks``."""
         position = {task: number for number, task in enumerate(self.tasks)}
         trained = []
         for block in self.blocks:
@@ -207,10 +203,7 @@ class Curriculum:
         return tuple(trained)
 
     def to_json(self, path: str | PathLike[str] | None = None) -> NamedValues:
-        """This curriculum as JSON with every field written out; see `ctgraph_rl.tasks.curriculum_json`.
-
-        Args:
-            path: where to write the file; None: nowhere.
+        """This curriculum as JSON, with every field written out, and written to ``path`` if given.
 
         Raises:
             ValueError: for a file that exists, and rewards, image sets or switches that are not of this package.
@@ -219,20 +212,17 @@ class Curriculum:
 
     @classmethod
     def from_json(cls, path_or_dict: str | PathLike[str] | ReadOnlyValues) -> Curriculum:
-        """The curriculum that `to_json` wrote. Only types of this package are made.
-
-        Args:
-            path_or_dict: the file, or its content.
+        """The curriculum that `to_json` wrote, from a file or its content. Only types of this package are made.
 
         Raises:
-            ValueError: for a file that cannot be read or is too large, another fingerprint than the file states, keys
-                that are missing or unknown, and values out of range; names the file and the key.
+            ValueError: names file and key: an unreadable or too large file, another fingerprint than stated, missing or
+                unknown keys, or values out of range.
         """
         return read_curriculum(path_or_dict, cls)
 
     @cached_property
     def fingerprint(self) -> str:
-        """16 hex digits that depend on everything but name and source, equal on every machine."""
+        """16 hex digits of all but name and source, equal on every machine."""
         content = {**_canonical(self), "name": "-", "source": "-"}
         text = json.dumps([FINGERPRINT_SCHEMA, content], sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -244,7 +234,7 @@ def _some(names: Sequence[str], between: str = ", ") -> str:
 
 
 def _canonical(value: Any) -> Any:
-    """A value as plain JSON: dataclasses by name with the compared fields that differ from their defaults."""
+    """A value as plain JSON: dataclasses by name, with compared fields that differ from their defaults."""
     if is_dataclass(value) and not isinstance(value, type):
         found = {"type": type_name(type(value))}
         for field_ in fields(value):

@@ -59,7 +59,6 @@ _GRAPH_FACTS = (
     "reward_prob_random",
     "expected_episode_length",
 )
-"""Numbers that follow from a graph."""
 
 _KEYS = ("schema", "fingerprint", "name", "version", "source", "tasks", "blocks", "evaluation", "protocol")
 _DERIVED = "about"
@@ -69,10 +68,10 @@ _CHOICES: dict[tuple[type, str], tuple[type, ...]] = {
     (Task, "reward_fn"): tuple(REWARD_FNS.values()),
     (Block, "switch"): SWITCHES,
 }
-"""Fields that hold one of several types, so that JSON names it."""
+"""Fields that hold one of several types, which JSON names."""
 
 _PARTS: dict[tuple[type, str], type] = {(Task, "graph"): CTGraph, (Task, "observations"): Observations}
-"""Fields that hold always the same type."""
+"""Fields that hold one type."""
 
 _OF_TASKS = ((Block, "tasks"), (Evaluation, "held_out"))
 _OF_ARGUMENTS = ((GymTask, "kwargs"), (GymTask, "wrappers"))
@@ -80,15 +79,14 @@ _OF_ARGUMENTS = ((GymTask, "kwargs"), (GymTask, "wrappers"))
 _NAMED_TYPES = (*chain.from_iterable(_CHOICES.values()), TupleArgument, DictArgument)
 
 _OURS = (*_NAMED_TYPES, *_PARTS.values(), Task, Block, Evaluation, Protocol)
-"""All types in the JSON of a curriculum of CT-graphs."""
 
 
 TASK_KINDS: dict[str, type] = {GymTask.__name__: GymTask}
-"""Kinds of tasks of this package by name, beside `Task`, whose JSON names none."""
+"""Kinds of tasks by their names in JSON, beside `Task`, which has none."""
 
 
 def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = None) -> NamedValues:
-    """Return a curriculum as JSON, written into a file if a path is given."""
+    """Return a curriculum as JSON, and write it to ``path`` if given."""
     require((path is None or not lexists(path), f"{path} exists: choose another path, nothing is overwritten"))
     tasks = (*curriculum.tasks, *curriculum.evaluation.held_out)
     places: dict[TaskLike, int] = {task: i for i, task in enumerate(tasks)}
@@ -128,7 +126,7 @@ def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = 
 
 
 def read_curriculum(path_or_dict: str | PathLike[str] | ReadOnlyValues, make: Callable[..., Curriculum]) -> Curriculum:
-    """Return the curriculum of a JSON file or of its content, which ``make`` makes."""
+    """Return the curriculum, built by ``make``, of a JSON file or its content."""
     source, content = json_object(path_or_dict, "curriculum", MAX_BYTES, MAX_NESTING)  # `_check_form` knows numbers
     content = dict(content)
     content.pop(_DERIVED, None)
@@ -156,7 +154,7 @@ def read_curriculum(path_or_dict: str | PathLike[str] | ReadOnlyValues, make: Ca
 
 
 def _plain(value: Any, places: Mapping[TaskLike, int]) -> Any:
-    """Return one of our values as JSON, tasks by their places where these are given."""
+    """Return a value as JSON, with tasks by place if ``places`` is given."""
     if places and value in places:
         return places[value]
     if isinstance(value, tuple):
@@ -170,7 +168,7 @@ def _plain(value: Any, places: Mapping[TaskLike, int]) -> Any:
 
 
 def type_name(kind: type) -> str:
-    """Our own types only by name, so that they may move between modules; a user's with the module."""
+    """Return a type's name in JSON: ours by name only, so that they may move; a user's with the module."""
     return kind.__qualname__ if kind.__module__.startswith("ctgraph_rl.") else f"{kind.__module__}.{kind.__qualname__}"
 
 
@@ -179,12 +177,11 @@ def _names(kind: type) -> list[str]:
 
 
 def file_text(content: ReadOnlyValues) -> str:
-    """Return the text of the file of a curriculum that is given as JSON."""
+    """Return the text of a curriculum's file."""
     return _text(content) + "\n"
 
 
 def _text(value: Any, margin: str = "\n") -> str:
-    """JSON with indented objects, and lists of plain values on one line."""
     inner = margin + "  "
     if isinstance(value, dict):
         parts = [f"{json.dumps(key)}: {_text(item, inner)}" for key, item in value.items()]
@@ -195,7 +192,7 @@ def _text(value: Any, margin: str = "\n") -> str:
 
 
 def _check_form(value: Any, nesting: int = 1) -> None:
-    """Refuse what is no JSON, nested too deeply, or no number of 64 bits."""
+    """Refuse what is not JSON, nested too deeply, or beyond numbers of 64 bits."""
     if isinstance(value, (Mapping, list)):
         require((nesting <= MAX_NESTING, f"nested more than {MAX_NESTING} deep"))
         for key, item in value.items() if isinstance(value, Mapping) else enumerate(value):
@@ -210,7 +207,6 @@ def _check_form(value: Any, nesting: int = 1) -> None:
 
 
 def _check_keys(content: Any, names: Sequence[str], optional: Sequence[str] = ()) -> None:
-    """Refuse anything but an object with exactly these keys."""
     require((isinstance(content, Mapping), f"must be an object with {', '.join(names)}, got {content!r:.80}"))
     missing = [name for name in names if name not in content]
     known = {*names, *optional}
@@ -241,7 +237,7 @@ def _task(content: Any) -> TaskLike:
 
 
 def _kind(name: Any) -> type:
-    """Return the class of tasks that a file names: one of ours, or of a module that is imported already."""
+    """Return the class of tasks that a file names: ours, or of an imported module."""
     require((isinstance(name, str), f"type must be the name of a kind of tasks, got {name!r:.80}"))
     if name in TASK_KINDS:
         return TASK_KINDS[name]
@@ -263,7 +259,7 @@ def _each(name: str, content: Any, read: Callable[[Any], Any]) -> list[Any]:
 
 
 def _built(kind: type, content: Any, tasks: Sequence[TaskLike] = ()) -> Any:
-    """Return an object of a class from its fields; those that hold tasks name them by their places."""
+    """Return an object of a class from its fields, with tasks by place."""
     added = [field.name for field in fields(kind) if field.metadata.get("added")]
     _check_keys(content, [name for name in _names(kind) if name not in added], added)
     arguments = {}
@@ -286,7 +282,6 @@ def _field(place: tuple[type, str], content: Any, tasks: Sequence[TaskLike]) -> 
 
 
 def _chosen(kinds: Sequence[type], content: Any) -> Any:
-    """Return an object of the class that its ``type`` names."""
     require((isinstance(content, Mapping), f"must be an object with a type, got {content!r:.80}"))
     names = by_name(*kinds)
     given = content.get("type")

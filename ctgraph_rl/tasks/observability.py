@@ -1,9 +1,8 @@
 """How much of its state a task shows: states per observation, and the entropy of the state given the observation.
 
-Observations are ids: noise and rotation on read are left out. Every observation of an episode counts, the last one in
-the fail state or an end state, too, but not that of the home state after an ``extra_end_step``. Ids of different kinds
-of states never overlap, so an observation says the kind of its state, and all that is open is the place in the
-tree. Levels count decisions: level k has b^k wait states and, below the depth, b^k decision states.
+Observations are ids, without noise and rotation on read. Every observation of an episode counts, the last one too, but
+not the home state's after an ``extra_end_step``. Ids of different kinds of states never overlap, so an observation
+leaves only the place in the tree open. Level k has b^k wait states and, below the depth, b^k decision states.
 """
 
 from __future__ import annotations
@@ -20,19 +19,17 @@ POLICIES = ("random", "navigation", "optimal")
 """The policies of section 2.2 of the paper."""
 
 PLACED = (StateType.WAIT, StateType.DECISION, StateType.END)
-"""Kinds of which a graph may have several states."""
+"""Kinds with possibly several states."""
 
 VisitsByLevel = dict[StateType, dict[int, float]]
-"""Expected visits of an episode to the states of each kind, by level."""
+"""Expected visits by kind and level."""
 
 
 def states_per_observation(task: Task) -> dict[str, int]:
-    """Return for wait, decision and end states how many states may show one and the same observation.
-
-    1 where each state has its own id.
+    """Return for wait, decision and end states how many may show one observation; 1: each has its own id.
 
     Raises:
-        ValueError: for a ``legacy_index`` with more than two branches, where unlike numbers of states share ids.
+        ValueError: for a ``legacy_index`` with b > 2, where ids are shared unequally.
     """
     require(_index_rule(task))
     x = task.observations
@@ -45,16 +42,16 @@ def states_per_observation(task: Task) -> dict[str, int]:
 
 
 def state_entropy(task: Task, policy: str = "random") -> float:
-    """Return H(state | observation) in bits, with observations as often as a policy meets them.
+    """Return H(state | observation) in bits, weighted by a policy's visits.
 
-    With v(s) the expected visits of state s in an episode and v(O) those of all states that show the same ids as s,
+    With v(s) the expected visits of state s in an episode and v(O) those of all states with its ids,
 
         H = -sum_s v(s) / v * log2(v(s) / v(O)),    v = sum_s v(s).
 
-    0 for a fully observable task. Wait states are counted once for every step in them.
+    Every step in a wait state counts. 0 for a fully observable task.
 
     Args:
-        task: any task; its goal counts only for the optimal policy.
+        task: its goal counts only for the optimal policy.
         policy: ``random``, uniform over the b + 1 actions; ``navigation``, waits at wait states and decides uniformly;
             ``optimal``, waits at wait states and decides for the goal.
 
@@ -73,27 +70,26 @@ def state_entropy(task: Task, policy: str = "random") -> float:
 
 
 def transition_entropy(task: Task, policy: str = "navigation", informed: bool = True) -> float:
-    """Return the least bits a step that a predictor of the next observation and reward can need.
+    """Return the least bits per step that a predictor of the next observation and reward can need.
 
-    Ids of different kinds of states never overlap, so who sees the observations and actions of an episode knows the
-    state, and only two things are open: whether a wait state is left, and which of its ids a state shows. With v(kind)
-    the expected visits of an episode, l(kind) = log2 of the ids that a state of this kind draws from, 0 for unique
-    ones, a the probability to wait at a wait state, c that to decide at a decision state, n = 1 + v(W) + v(D) steps,
-    and h the binary entropy,
+    Ids of different kinds of states never overlap, so observations and actions tell the state. Only two things are
+    open: whether a wait state is left, and which of its ids a state shows. With v(kind) the expected visits of an
+    episode, l(kind) = log2 of the ids that a state draws from (0 for unique ones), a the probability to wait at a wait
+    state, c that to decide at a decision state, n = 1 + v(W) + v(D) steps, and h the binary entropy,
 
         n H = l(W) + v(D) (c l(W) + (1 - c) l(F)) + v(W) (1 - a) l(F)
               + sum over levels k of v(W, k) a (h(p) + p l(W) + (1 - p) l(D, or E at the last level)).
 
-    Rewards follow from the state and add nothing. Without information, neither the last observation nor the action,
-    a predictor needs the entropy of how often each pair of observation and reward comes.
+    Rewards follow from the state and add nothing. An uninformed predictor, without last observation and action, needs
+    the entropy of the pairs of observation and reward.
 
     Args:
-        task: whose rewards are no chance: the needle, without noise.
-        policy: see `state_entropy`.
+        task: with a needle and no noise of rewards.
+        policy: as in `state_entropy`.
         informed: False gives the entropy of the pairs.
 
     Raises:
-        ValueError: as for `state_entropy`, and for rewards, goals and images that are drawn, and an extra last step.
+        ValueError: as for `state_entropy`, and for drawn rewards, goals or images, and an extra last step.
     """
     x = task.observations
     p = task.graph.wait_prob
@@ -123,7 +119,7 @@ def transition_entropy(task: Task, policy: str = "navigation", informed: bool = 
 
 
 def _drawn_bits(task: Task, kind: StateType) -> float:
-    """log2 of the ids that a state of a kind draws from."""
+    """log2 of the ids that a state draws from."""
     if task.observations.is_unique(kind):
         return 0.0
     first, last = task.observations.ids(kind)
@@ -133,7 +129,7 @@ def _drawn_bits(task: Task, kind: StateType) -> float:
 def _pair_bits(visits: VisitsByLevel, bits: Mapping[StateType, float], task: Task, branches: int) -> float:
     """-sum over pairs of c log2(c / n), where a pair of observation and reward comes c times in an episode's n steps.
 
-    Equal pairs are one group, (their expected number together, log2 of how many there are).
+    Equal pairs are one group: (expected number together, log2 of how many).
     """
     count = _count(visits)
     goal = branches**-task.graph.depth
@@ -158,12 +154,12 @@ def _chances(graph: CTGraph, policy: str) -> tuple[float, float]:
 
 
 def _branches(graph: CTGraph, policy: str) -> int:
-    """How many branches of a decision state a policy takes, each as often."""
+    """How many branches a policy takes at a decision state, equally often."""
     return 1 if policy == "optimal" else graph.branching_factor
 
 
 def _visits(graph: CTGraph, waits: float, decides: float) -> VisitsByLevel:
-    """Expected visits of each kind of state by level; home has one visit, and the fail state the rest of the ends."""
+    """Expected visits by kind and level; home has one, and the fail state the rest of the ends."""
     p = graph.wait_prob
     leaves = waits * (1 - p) / (1 - waits * p)
     visits: VisitsByLevel = {kind: {} for kind in PLACED}

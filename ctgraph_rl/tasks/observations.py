@@ -1,6 +1,6 @@
-"""X: which observation id a state shows. The images behind the ids are in `ctgraph_rl.tasks.images`.
+"""X: which observation id a state shows.
 
-Section 2.4 of the paper. The id ranges are inclusive, as in the paper's JSON (W_IDs, D_IDs, graph_ends).
+Section 2.4 of the paper; id ranges are inclusive, as in its JSON (W_IDs, D_IDs, graph_ends).
 """
 
 from __future__ import annotations
@@ -13,38 +13,38 @@ from ctgraph_rl.checks import Rule, as_tuple, is_int, make_fields_plain, require
 from ctgraph_rl.core.graph import CTGraph, StateType
 
 Ids = tuple[int, int]
-"""First and last id of a subset, both included."""
+"""First and last id, both included."""
 
 MAX_READ_ROTATION = 359
 
 
 @dataclass(frozen=True)
 class Observations:
-    """The observation process X of a task: the ids of each kind of state, and the variation on read.
+    """The observation process X: the ids of each kind of state, and the variation on read.
 
     Fully observable: ``unique_decisions`` and ``unique_waits`` (MDP_D, MDP_W of the paper). Surjective: ranges of
     one id. Confounding: longer ranges without uniqueness; an id is then drawn for every observation.
 
     Args:
-        wait_ids: ids of wait states, O^W.
-        decision_ids: ids of decision states, O^D.
-        end_ids: ids of end states, O^E.
-        home_ids: ids of the home state, O^H.
-        fail_ids: ids of the fail state, O^F.
+        wait_ids: O^W.
+        decision_ids: O^D.
+        end_ids: O^E.
+        home_ids: O^H.
+        fail_ids: O^F.
         unique_waits: each wait state has its own id.
-        unique_decisions: each decision state has its own id.
-        unique_ends: each end state has its own id; None means: when waits or decisions have.
-        read_noise: each pixel gets an integer drawn from 0..read_noise added, saturating at 255.
+        unique_decisions: likewise.
+        unique_ends: likewise; None: when waits or decisions have.
+        read_noise: each pixel gains an integer drawn from 0..read_noise, saturating at 255.
         read_rotation: images are rotated by a whole number of degrees drawn from 0..read_rotation.
-        reward_cue: the images of end states show what was paid, as the brightness of a square in their middle.
+        reward_cue: a square in the middle of end images shows what was paid, by its brightness.
         legacy_index: number unique ids as the authors' implementation does: a state after k decisions, number j of the
             b^k of its level, gets id (b^k - 1 + j) modulo the size of its range. For b >= 3 states share ids in ranges
-            of exactly their number, and end states begin with another id than the first.
-        noise_before_rotation: read as the authors' implementation does: first noise, then rotation.
-        cue_wraps: the brightness of the cue is taken modulo 256, as there, instead of saturating.
+            of their number, and end states do not begin with the first id.
+        noise_before_rotation: as in the authors' implementation.
+        cue_wraps: the cue's brightness is taken modulo 256, as there, instead of saturating.
 
     Raises:
-        ValueError: for ranges that are reversed or overlap, and values out of range.
+        ValueError: for reversed or overlapping ranges, and values out of range.
     """
 
     wait_ids: Ids
@@ -93,7 +93,7 @@ class Observations:
         )
 
     def ids(self, kind: StateType) -> Ids:
-        """First and last id of a kind of state."""
+        """Ids of a kind of state."""
         return getattr(self, f"{kind.name.lower()}_ids")
 
     def is_unique(self, kind: StateType) -> bool:
@@ -111,13 +111,13 @@ class Observations:
         return any(not self.is_unique(kind) and self.ids(kind)[0] < self.ids(kind)[1] for kind in StateType)
 
     def first_of_level(self, graph: CTGraph, kind: StateType, level: int) -> int:
-        """Return how many unique ids of a kind precede those of a level of the tree, or the legacy number instead."""
+        """Return how many of a kind's unique ids precede a level of the tree, or the legacy number."""
         if self.legacy_index:
             return graph.branching_factor**level - 1
         return 0 if kind == StateType.END else graph.first_node(level)
 
     def rules(self, graph: CTGraph) -> list[Rule]:
-        """Return the rules on a graph: unique ids need as many ids as there are states."""
+        """Return the rules on a graph: unique ids need an id per state."""
         found = []
         for kind in filter(self.is_unique, StateType):
             name = kind.name.lower()

@@ -1,8 +1,8 @@
-"""The JSON parameters of Table 3 of the paper, with its names and its meaning.
+"""The JSON parameters of Table 3 of the paper.
 
-Keys that a file leaves out have defaults: ``graph_shape`` is enough. Rewards are those of the paper, their noise
-is additive, and an episode ends in the end state. Files of the authors' implementation are of another kind: they have a
-section ``image_dataset``, and `ctgraph_rl.tasks.reference` reads them.
+``graph_shape`` is enough; other keys have defaults. Rewards are the paper's, their noise is additive, and an episode
+ends in the end state. Files of the authors' implementation have a section ``image_dataset``, and
+`ctgraph_rl.tasks.reference` reads them.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ SECTIONS: dict[str, dict[str, str]] = {
         "rotation_on_read": "read_rotation",
     },
 }
-"""What each key means here, by section. A space in a name counts as an underscore."""
+"""What each key means here, by section. A space in a name is an underscore."""
 
 SEED = "Seed"
-"""Seed of the environment's random numbers, which is no part of a task."""
+"""Of the environment, not of a task."""
 
 DEFAULTS: NamedValues = {
     "wait_prob": 0.0,
@@ -54,7 +54,7 @@ DEFAULTS: NamedValues = {
 
 
 def is_paper_json(content: ReadOnlyValues) -> bool:
-    """Return whether a file is one of Table 3, and not one of the authors' implementation."""
+    """Return whether a file is one of Table 3, not of the authors' implementation."""
     shape = content.get("graph_shape")
     return "image_dataset" not in content and isinstance(shape, Mapping) and bool({"d", "b"} & shape.keys())
 
@@ -105,17 +105,17 @@ def _found(source: str, content: ReadOnlyValues) -> Iterator[tuple[str, Any]]:
 
 
 def suggested(name: object, known: Sequence[str]) -> str:
-    """Return the end of a message about an unknown name: the nearest one, or all."""
+    """Return the end of a message about an unknown name: the nearest known one, or all."""
     close = get_close_matches(str(name), known, n=1)
     return f"; did you mean {close[0]!r}?" if close else f"; the choices are {', '.join(known)}"
 
 
 def shown_ids(graph: CTGraph, found: ReadOnlyValues) -> Observations:
-    """Return the ids of wait, decision and end states: given ones, else the next that are free.
+    """Return the ids of wait, decision and end states: given ones, else the next free.
 
     Args:
         graph: the tree.
-        found: ``unique_waits`` and ``unique_decisions``, and ``wait_ids`` and ``decision_ids`` if they are given.
+        found: ``unique_waits`` and ``unique_decisions``; optional ``wait_ids`` and ``decision_ids``.
     """
     sizes = {
         "wait_ids": graph.num_wait_states if found["unique_waits"] else 1,
@@ -133,7 +133,7 @@ def shown_ids(graph: CTGraph, found: ReadOnlyValues) -> Observations:
 
 
 def _next(ids: ReadOnlyValues) -> int:
-    """Return the id after all that are in use; 2 after the home and the fail state."""
+    """Return the id after all in use."""
     ranges = [as_tuple(each) for each in ids.values()]
     lasts = [last for each in ranges if isinstance(each, tuple) for last in each[-1:] if is_int(last)]
     return max([1, *lasts]) + 1

@@ -1,4 +1,4 @@
-"""The parts of a curriculum: blocks of tasks, the protocol of what the learner is given, and the evaluation."""
+"""The parts of a curriculum: blocks, the protocol of what the learner is given, and the evaluation."""
 
 from __future__ import annotations
 
@@ -30,21 +30,20 @@ MOST_IDS = 2**20
 """One-hot ids are held for every row."""
 
 MOST_ROWS = 2**24
-"""Of an evaluation; they take 10 GB."""
+"""Rows of an evaluation; they take 10 GB."""
 
 
 @dataclass(frozen=True)
 class Block:
     """One stay on one task, or on several.
 
-    Several tasks share the rows equally, all at once, or with a ``switch`` every row changes between them from episode
-    to episode, beginning with the first.
+    Several tasks share the rows equally. With a ``switch`` every row changes between them from episode to episode,
+    beginning with the first.
 
     Args:
         tasks: a task, or several.
         num_frames: frames to learn from; a frame is one row for one step.
-        switch: how rows change between the tasks, such as ``Drift(episodes=100)`` of `ctgraph_rl.tasks.switch`; None:
-            they do not.
+        switch: how rows change between the tasks, such as ``Drift(episodes=100)`` of `ctgraph_rl.tasks.switch`.
 
     Raises:
         ValueError: for no tasks, a budget below 1, or a switch with one task.
@@ -75,7 +74,7 @@ class Block:
         require((enough, "a block with a switch needs at least two tasks, got one; leave the switch out"))
 
     def rows(self, num_envs: int) -> list[TaskLike]:
-        """The task that each of ``num_envs`` rows begins with; several tasks without a switch take turns.
+        """The first task of each row; several tasks without a switch take turns.
 
         Raises:
             ValueError: if the tasks cannot share the rows equally.
@@ -87,7 +86,7 @@ class Block:
         return list(self.tasks) * (num_envs // count)
 
     def frame_rule(self, num_envs: int, name: str) -> Rule:
-        """Return the rule for ``num_envs`` rows: whole steps only. ``name`` says which block it is."""
+        """Return the rule that frames are whole steps of ``num_envs`` rows; ``name`` names the block."""
         below = self.num_frames - self.num_frames % num_envs
         near = f"{below} or {below + num_envs}" if below else f"{num_envs}"
         message = f"num_frames={self.num_frames} of {name} must be a multiple of num_envs={num_envs}; nearest: {near}"
@@ -96,21 +95,21 @@ class Block:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """When and how tasks are evaluated. It never disturbs what is random in training.
+    """When and how tasks are evaluated. Training's random numbers are unaffected.
 
     Args:
         num_episodes: episodes per task.
         greedy: take the most likely action; False samples as in training.
-        episodes_per_row: episodes that a row plays one after the other; a divisor of ``num_episodes``.
+        episodes_per_row: episodes that a row plays in turn; a divisor of ``num_episodes``.
         before: evaluate before any training.
-        every: evaluate within blocks, whenever the run's frames are a multiple of this; 0: not.
+        every: evaluate when the run's frames are a multiple of this; 0: not.
         at_block_ends: evaluate at the end of every block.
-        tasks: ``all`` tasks of the curriculum, or those ``seen`` so far, the present block's included.
-        held_out: further tasks that are evaluated each time and never trained.
-        adapt_episodes: episodes that a row plays before its ``episodes_per_row``, in which the agent may adapt to the
-            row's task. Means are over the episodes after them; the log also has the means of each episode of a row.
-        exact: compute the means of all episodes that could be played, and play none; ``num_episodes`` and
-            ``episodes_per_row`` have no effect. See `ctgraph_rl.learn.exact` for what has exact means.
+        tasks: ``all`` of the curriculum, or those ``seen`` up to the present block.
+        held_out: further tasks, evaluated each time and never trained.
+        adapt_episodes: episodes before a row's ``episodes_per_row``, in which the agent may adapt to its task. Means
+            leave them out; the log also has the means of each episode of a row.
+        exact: compute the means over all possible episodes and play none, where `ctgraph_rl.learn.exact` can;
+            ``num_episodes`` and ``episodes_per_row`` have no effect.
 
     Raises:
         ValueError: for values out of range.
@@ -152,11 +151,11 @@ class Evaluation:
 
     @property
     def row_episodes(self) -> int:
-        """All episodes that a row plays one after the other."""
+        """All episodes that a row plays."""
         return self.adapt_episodes + self.episodes_per_row
 
     def every_rule(self, num_envs: int) -> Rule:
-        """Return the rule for ``num_envs`` rows: evaluations fall between steps of all rows."""
+        """Return the rule that evaluations fall between steps of ``num_envs`` rows."""
         near = max(self.every - self.every % num_envs, num_envs)
         message = f"evaluation.every={self.every} must be a multiple of num_envs={num_envs}, such as {near}"
         return self.every % num_envs == 0, message
@@ -188,18 +187,18 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class Protocol:
-    """The information that the learner is given on tasks and on boundaries between blocks.
+    """What the learner is given on tasks and boundaries between blocks.
 
     Args:
         task_id: ``hidden``; ``one_hot``: every observation comes with a one-hot ``task_id``; ``at_boundaries``: the
-            agent is given the task's id where a block begins and where it is evaluated.
-        boundaries: ``announced``: at the start of a block all episodes end and the agent is notified; ``hidden``: each
-            row changes to the next block's task when its episode ends, without notice to the agent.
+            agent is given the task's id when a block or an evaluation begins.
+        boundaries: ``announced``: at a block's start all episodes end and the agent is notified; ``hidden``: each row
+            changes task when its episode ends, without notice.
         num_task_ids: length of the one-hot id; None: just enough.
         task_ids: the id of each of the curriculum's ``tasks``, all different; None: their positions, from 0.
-        guide_frames: frames after each announced boundary over which the share of new episodes in which a policy that
-            navigates acts in the learner's place falls from 1 to 0. It waits where it must and decides at random, so
-            the learner need not find its first rewards. 0: only the learner acts.
+        guide_frames: frames after each announced boundary over which a guide's share of new episodes falls from 1 to 0.
+            The guide waits where it must and decides at random, so that the learner sees rewards early. 0: only the
+            learner acts.
 
     Raises:
         ValueError: for values out of range, and ids given at boundaries that are hidden.
@@ -231,7 +230,7 @@ class Protocol:
 
     @property
     def announces(self) -> bool:
-        """Whether boundaries between blocks are announced to the agent."""
+        """Whether the agent is notified of boundaries."""
         return self.boundaries == "announced"
 
     def ids(self, num_tasks: int) -> tuple[int, ...]:
@@ -254,10 +253,10 @@ class Protocol:
 
 
 def changed(name: str, part: ProtocolPart, changes: ReadOnlyValues) -> ProtocolPart:
-    """An evaluation or a protocol with other values of some fields; ``name`` is that of the part, for errors.
+    """An evaluation or a protocol with other values; ``name`` is the part's, for errors.
 
     Raises:
-        ValueError: for a name of no field, with the one that was probably meant, and for values out of range.
+        ValueError: for an unknown field, with the likely one, and for values out of range.
     """
     known = [each.name for each in fields(part)]
     require(*((key in known, f"{name} has no {key}: {did_you_mean(key, known)}") for key in changes))

@@ -1,7 +1,4 @@
-"""The configuration files of the authors' implementation, in all three dialects.
-
-`Task.from_json` and `Task.to_json` read and write them.
-"""
+"""The configuration files of the authors' implementation, in all three dialects."""
 
 from __future__ import annotations
 
@@ -58,17 +55,17 @@ _KEYS: dict[str, tuple[str, str | None, str | None, str | None]] = {  # section,
     "noise": ("image_dataset", "noise_on_images_on_read", "noise_on_images_on_read", "noise_on_read"),
     "rotation": ("image_dataset", "small_rotation_on_read", "small_rotation_on_read", "rotation_on_read"),
 }
-"""The dialects: what a key means here, and how each dialect calls it; None where it has no such key."""
+"""By key of a dialect: what it means here, and its name in each dialect; None where it has none."""
 
 MAX_BYTES = 2**20
-"""Largest file that is read: 1 MiB; one has 2 kB."""
+"""Largest file read, 1 MiB."""
 
 _SECTIONS = tuple(dict.fromkeys(section for section, *_ in _KEYS.values()))
 
 _DISTRIBUTIONS: dict[str, RewardFn] = {"needle_in_haystack": Needle(), "linear": ReferenceLinear()}
 
 _LEGACY: NamedValues = {"reward_cue": True, "cue_wraps": True, "legacy_index": True, "noise_before_rotation": True}
-"""How the authors' implementation shows states, whatever a file says."""
+"""How the authors' implementation shows states."""
 
 
 def read_task(path_or_dict: str | PathLike[str] | ReadOnlyValues, goal: Goal | None) -> NamedValues:
@@ -141,7 +138,7 @@ def _surplus(section: str, key: str, dialect: str) -> str:
 
 
 def _value_rules(found: NamedValues, places: dict[str, tuple[str, str]]) -> list[Rule]:
-    """Return the rules for a file's values that the parts of a task do not check themselves."""
+    """Return the rules for values that a task's parts do not check."""
 
     def said(name: str) -> str:
         return f"{'.'.join(places[name])} must be"
@@ -212,7 +209,7 @@ def _arguments(found: NamedValues) -> NamedValues:
 
 
 def write_task(task: Task, path: str | PathLike[str] | None, general_seed: int) -> NamedValues:
-    """Return a task as a configuration file of the 2023 dialect, written if a path is given."""
+    """Return a task as a file of the 2023 dialect, written to ``path`` if given."""
     require(
         (path is None or not lexists(path), f"{path} exists: choose another path, nothing is overwritten"),
         (is_int(general_seed, 0, MAX_SEED), f"general_seed must be in [0, 2**32), got {general_seed!r}"),
@@ -256,7 +253,7 @@ def _expressible(task: Task) -> list[Rule]:
 
 
 def _values(task: Task) -> NamedValues:
-    """A task in the words of `_KEYS`."""
+    """A task by the keys of `_KEYS`."""
     x = task.observations
     images = task.images
     first, last = task.goal_change or (-1, -2)

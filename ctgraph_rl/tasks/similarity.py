@@ -1,11 +1,9 @@
 """Similarity of tasks: exact measures of goals, optimal actions, images and graphs, as matrices.
 
 All measures are shares in [0, 1] and symmetric. States of two graphs are matched by the branches that lead to them, in
-the *common tree*: branches and depth up to the smaller of both. *Optimal* is what maximises the expected discounted
-return; actions are as those of an environment with all tasks, where one above a task's branching factor fails. Where
-nothing is at stake, such as off the way to a needle that costs nothing to miss, all actions are optimal.
-
-Goals that change, and noise and rotation on read, are left aside.
+the *common tree*: branches and depth up to the smaller of both. *Optimal* actions maximise the expected discounted
+return; those above a task's branching factor fail. Where nothing is at stake, all actions are optimal. Goals that
+change, and noise and rotation on read, are left aside.
 """
 
 from __future__ import annotations
@@ -29,24 +27,24 @@ from ctgraph_rl.tasks.task import Task
 from ctgraph_rl.tasks.values import MAX_ENUMERATED_STATES, BestActions, is_needle, smallest_tree
 
 ROUNDING = 1e-9
-"""Actions whose values differ by no more than this, relative to the largest value of the task, are equally good."""
+"""Actions are equally good within this difference, relative to the task's largest value."""
 
 MAX_COMPARED_BYTES = 2**31
-"""Largest image set whose images are compared."""
+"""Largest image set that is compared."""
 
 CHOOSING = (StateType.WAIT, StateType.DECISION)
-"""The states whose actions matter: home leads on whatever the action."""
+"""States whose actions matter."""
 
 ON_THE_WAY = 0
 ELSEWHERE = 1
-"""The two kinds of nodes of a tree that collapses."""
+"""The two kinds of nodes of a collapsed tree."""
 
 ActionSets = dict[tuple[StateType, int], list[int]]
-"""Sets of actions by kind and level, each an integer with a bit for each action."""
+"""Sets of actions by kind and level, each an integer with a bit per action."""
 
 
 def shared_decisions(tasks: Sequence[Task]) -> Tensor:
-    """Decisions that two goals share from the first on, as a share of the shorter goal's; float64 [T, T].
+    """The first decisions that two goals share, relative to the shorter goal; float64 [T, T].
 
     (1, 2, 1) and (1, 2) share 1.0, (1, 2, 1) and (1, 1, 1) share 1/3.
 
@@ -70,11 +68,7 @@ def shared_decisions(tasks: Sequence[Task]) -> Tensor:
 def state_agreement(tasks: Sequence[Task], gamma: float = 1.0) -> Tensor:
     """Share of the wait and decision states of the common tree with equal sets of optimal actions; float64 [T, T].
 
-    Two needles take O(depth); other rewards visit every state.
-
-    Args:
-        tasks: any tasks.
-        gamma: discount, in [0, 1].
+    Two needles take O(depth); other rewards visit every state. ``gamma`` is in [0, 1].
 
     Raises:
         ValueError: for rewards other than `Needle` beyond `values.MAX_ENUMERATED_STATES` states.
@@ -93,15 +87,11 @@ def state_agreement(tasks: Sequence[Task], gamma: float = 1.0) -> Tensor:
 
 
 def observation_agreement(tasks: Sequence[Task], gamma: float = 1.0) -> Tensor:
-    """The same for what a policy without memory sees: a share of the observations shown in both tasks; float64 [T, T].
+    """Share of the observations of both tasks whose optimal memoryless actions are equal; float64 [T, T].
 
     For each image that wait and decision states of both tasks can show, a task leaves the actions that are optimal in
-    all of its states that can show it. Tasks agree where they leave the same actions, and any at all. So the diagonal
-    is below 1 for tasks that need memory. nan where no image is shown in both.
-
-    Args:
-        tasks: any tasks.
-        gamma: discount, in [0, 1].
+    all of its states that can show it. Tasks agree where they leave the same actions, and any at all: the diagonal is
+    below 1 for tasks that need memory. nan where no image is shown in both. ``gamma`` is in [0, 1].
 
     Raises:
         ValueError: beyond `values.MAX_ENUMERATED_STATES` states where every state has to be visited, and for image sets
@@ -123,9 +113,9 @@ def observation_agreement(tasks: Sequence[Task], gamma: float = 1.0) -> Tensor:
 
 
 def shared_images(tasks: Sequence[Task]) -> Tensor:
-    """Images shown in both tasks as a share of those shown in either (Jaccard), by content; float64 [T, T].
+    """Images shown in both tasks as a share of those in either (Jaccard), by content; float64 [T, T].
 
-    Images are those that states of any kind can show; vectors of different lengths are padded with zeros.
+    Vectors of different lengths are padded with zeros.
 
     Raises:
         ValueError: for image sets of more than `MAX_COMPARED_BYTES`, and too many states with unique ids.
@@ -142,8 +132,8 @@ def shared_images(tasks: Sequence[Task]) -> Tensor:
 def graph_containment(tasks: Sequence[Task]) -> Tensor:
     """Share of the smaller graph's decision states that the larger graph has too; float64 [T, T].
 
-    1 where the larger has at least the depth and the branching factor of the smaller one, whatever their wait
-    probabilities. A decision state whose branches are swapped in one of the two tasks is not the same in both.
+    1 if the larger has at least the depth and branching factor of the smaller, whatever their wait probabilities. A
+    decision state with branches swapped in one task only is not shared.
     """
 
     def share(one: Task, other: Task) -> float:
@@ -168,7 +158,6 @@ MEASURES: dict[str, Callable[[Sequence[Task]], Tensor]] = {
     "shared images": shared_images,
     "containment of the smaller graph": graph_containment,
 }
-"""All measures by what they measure."""
 
 
 def _tasks(tasks: Sequence[Task]) -> tuple[Task, ...]:
@@ -191,10 +180,7 @@ def _common(one: Task, other: Task) -> CTGraph:
 
 @dataclass(frozen=True)
 class _Choices:
-    """The optimal actions of a task: sets by kind and level, of every node or, collapsed, on the way and off.
-
-    A set of actions is an integer with a bit for each.
-    """
+    """The optimal actions of a task by kind and level: of every node or, collapsed, on the way and off."""
 
     task: Task
     sets: ActionSets
@@ -207,12 +193,12 @@ class _Choices:
         return [node - graph.first_node(level) for level, node in enumerate(nodes)]
 
     def of_path(self, kind: StateType, path: tuple[int, ...]) -> int:
-        """The set at a node of a collapsed tree by the decisions that lead to it."""
+        """The set at a node of a collapsed tree."""
         level = len(path)
         return self.sets[kind, level][ON_THE_WAY if path == self.task.goal[:level] else ELSEWHERE]
 
     def of_nodes(self, kind: StateType, level: int, nodes: Sequence[int]) -> list[int]:
-        """The sets at nodes by their numbers within a level."""
+        """The sets at nodes by number within a level."""
         sets = self.sets[kind, level]
         goal = self.goal_nodes[level]
         return [sets[ON_THE_WAY if node == goal else ELSEWHERE] if self.collapsed else sets[node] for node in nodes]
@@ -230,7 +216,7 @@ def _choices(tasks: tuple[Task, ...], gamma: float) -> list[_Choices]:
 
 
 def _optimal_sets(task: Task, gamma: float, num_actions: int) -> ActionSets:
-    """Backward induction from the end states, as `values` does it, that keeps what is optimal."""
+    """Backward induction as in `values`, keeping the optimal actions."""
     tree = smallest_tree(task, is_needle(task))
     best = BestActions(task, gamma)
     step = task.step_reward
@@ -250,7 +236,7 @@ def _optimal_sets(task: Task, gamma: float, num_actions: int) -> ActionSets:
 
 
 def _best(values: Tensor, fails: float, num_actions: int, first: int, margin: float) -> list[int]:
-    """The sets of best actions: ``values`` [n, m] are those of the actions from ``first`` on, any other one fails."""
+    """The sets of best actions: ``values`` [n, m] are those from ``first`` on; any other fails."""
     best = values.amax(-1).clamp_min(fails) - margin
     rows, which = torch.unique(values >= best.unsqueeze(-1), dim=0, return_inverse=True)
     tried = ((1 << values.shape[1]) - 1) << first
@@ -264,7 +250,7 @@ def _best(values: Tensor, fails: float, num_actions: int, first: int, margin: fl
 
 
 def _equal_on_ways(one: _Choices, other: _Choices, kind: StateType, level: int, b: int) -> int:
-    """Equal states of a level: those on the ways to two needles one by one, all others at once."""
+    """Equal states of a level: those on the ways to two needles singly, all others at once."""
     ways = {one.task.goal[:level], other.task.goal[:level]}
     inside = [path for path in ways if max(path, default=1) <= b]
     equal = sum(one.of_path(kind, path) == other.of_path(kind, path) for path in inside)
@@ -282,7 +268,7 @@ def _equal_everywhere(one: _Choices, other: _Choices, kind: StateType, level: in
 
 @lru_cache(maxsize=64)
 def _nodes(own_b: int, b: int, level: int) -> list[int]:
-    """Numbers within a level of the nodes that b decisions reach, in their order."""
+    """Numbers within a level of the nodes that b decisions reach."""
     if level == 0:
         return [0]
     nodes: list[int] = []
@@ -292,7 +278,7 @@ def _nodes(own_b: int, b: int, level: int) -> list[int]:
 
 
 def _shown_with_actions(choice: _Choices) -> Iterator[tuple[Sequence[int], int]]:
-    """Ids, and a set of actions that is optimal in every state that shows them."""
+    """Ids, and the actions that are optimal in every state that shows them."""
     task = choice.task
     for kind in CHOOSING:
         if not task.observations.is_unique(kind):
@@ -338,7 +324,7 @@ def _unique_ids(task: Task, kind: StateType, level: int) -> list[int]:
 
 
 def _contents(task: Task, ids: Sequence[int]) -> Iterator[bytes]:
-    """Return a digest of each image behind ids, equal for equal images of any set."""
+    """Return a digest of each image, equal for equal images of any set."""
     needed = bank_bytes([task])
     variants = task.images.num_variants
     rule = f"images of {needed:,} bytes are too many to compare, the limit is {MAX_COMPARED_BYTES:,}; use fewer"
@@ -350,7 +336,7 @@ def _contents(task: Task, ids: Sequence[int]) -> Iterator[bytes]:
 
 @lru_cache(maxsize=256)
 def _digests(images: ImageSet) -> list[bytes]:
-    """A hash of every image; of vectors without the zeros at their end."""
+    """A hash of every image; vectors without their last zeros."""
     rows = images.bank(0).numpy()
     vectors = rows.ndim == 2
     shape = repr(rows.shape[2:]).encode()

@@ -1,8 +1,7 @@
 """Changes of the task within a block: by the episode, at random times, or by drift, without any boundary.
 
-A switch decides which of a block's tasks an episode has. Its clock counts episodes: those that a row has completed in
-the block, or, for all rows ``together``, the mean over the rows, rounded down. A change takes effect where a row starts
-an episode, never within one.
+A switch decides which of a block's tasks an episode has. Its clock counts the row's completed episodes in the block or,
+for rows ``together``, the rows' mean, rounded down. Changes happen where an episode starts.
 """
 
 from __future__ import annotations
@@ -17,22 +16,22 @@ from ctgraph_rl.checks import Rule, is_int, is_real, make_fields_plain, require,
 from ctgraph_rl.core.philox import randint
 
 MOST_EPISODES = 2**31
-"""Drifts are drawn with 32-bit words."""
+"""Drifts draw 32-bit words."""
 
 
 class Switch(Protocol):
-    """A rule for the next task. A user's own is a frozen dataclass with these members."""
+    """A rule for the next task; a user's own is a frozen dataclass with these members."""
 
     @property
     def together(self) -> bool:
-        """All rows change by one clock and one draw; False: each row by its own."""
+        """All rows share one clock and one draw."""
         ...
 
     def next_task(self, task: Tensor, clock: Tensor, num_tasks: int, words: tuple[Tensor, ...]) -> Tensor:
-        """The positions in the block of the tasks of the episodes that start now; tensors of one shape.
+        """The tasks of the episodes that start now, as positions in the block; tensors of one shape.
 
         Args:
-            task: int64, the position of the last episode's task.
+            task: int64, the last episode's task.
             clock: int64, episodes completed, at least 1.
             num_tasks: tasks of the block.
             words: at least two random words in [0, 2**32) each.
@@ -41,8 +40,6 @@ class Switch(Protocol):
 
 
 class _ForEpisodes:
-    """What changes after a number of episodes."""
-
     episodes: int
     together: bool
 
@@ -72,12 +69,10 @@ class ByEpisode(_ForEpisodes):
 
 @dataclass(frozen=True)
 class AtRandom:
-    """At each start of an episode the task changes with a probability, to any other one of the block.
-
-    A task lasts 1 / ``prob`` episodes in the mean.
+    """At each start of an episode the task changes with a probability, to any other of the block.
 
     Args:
-        prob: in (0, 1]; below 2**-32 it never changes.
+        prob: in (0, 1]; a task lasts 1 / ``prob`` episodes on average. Below 2**-32 it never changes.
         together: all rows change at once.
     """
 
@@ -91,7 +86,7 @@ class AtRandom:
         object.__setattr__(self, "prob", float(self.prob))
 
     def next_task(self, task: Tensor, clock: Tensor, num_tasks: int, words: tuple[Tensor, ...]) -> Tensor:
-        """Return the same task, or with the probability another one."""
+        """Return the same task, or by chance another."""
         other = (task + 1 + randint(words[1], num_tasks - 1)) % num_tasks
         return torch.where(words[0] < int(self.prob * 2**32), other, task)
 
@@ -100,7 +95,7 @@ class AtRandom:
 class Drift(_ForEpisodes):
     """The probability of the next task rises linearly: from 0 at the start to 1 after ``episodes`` episodes.
 
-    With more than two tasks the drift goes from each to the next, and after the last it stays there.
+    The drift goes from each task to the next, and stays at the last.
 
     Args:
         episodes: episodes from one task to the next.
@@ -111,16 +106,16 @@ class Drift(_ForEpisodes):
     together: bool = False
 
     def next_task(self, task: Tensor, clock: Tensor, num_tasks: int, words: tuple[Tensor, ...]) -> Tensor:
-        """Return the task of the clock, or as often as the drift has come to it the next one."""
+        """Return the clock's task or, by chance, the next."""
         is_next = randint(words[0], self.episodes) < clock % self.episodes
         return (clock // self.episodes + is_next).clamp_max(num_tasks - 1)
 
 
 SWITCHES = (ByEpisode, AtRandom, Drift)
-"""Every switch of this package; JSON names them by their classes."""
+"""Every switch of this package."""
 
 
 def switch_rule(switch: object) -> Rule:
-    """The rule for switches, a user's own among them."""
+    """The rule that a value is a switch."""
     holds = callable(getattr(switch, "next_task", None)) and not isinstance(switch, type)
     return holds, f"switch must be one such as Drift(100), got {switch!r}"

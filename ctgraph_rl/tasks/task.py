@@ -35,11 +35,11 @@ REWARDS = ("goal_reward", "fail_reward", "step_reward", "reward_std")
 NOISES = ("additive", "multiplicative")
 
 MAX_EPISODES = 2**31
-"""Episodes are drawn with 32-bit words."""
+"""Episodes draw 32-bit words."""
 
 SMALLEST_CUED_REWARD = 1e-30
 LARGEST_REWARD = 1e30
-"""Rewards are float32, and their sums and noise must stay finite."""
+"""Keeps float32 rewards, their sums and noise finite."""
 
 
 @dataclass(frozen=True)
@@ -52,26 +52,26 @@ class Task:
         graph: shape of the tree, <b, d, p>.
         goal: the branches that lead to the goal, d integers in 1..b, as ``"1.2"`` or (1, 2); afterwards a tuple. They
             are the decisions to take, but for ``swapped_branches``.
-        observations: which id each state shows, X.
-        images: what is behind the ids, O.
+        observations: X.
+        images: O.
         reward_fn: the share of ``goal_reward`` that each end state pays, g.
         goal_reward: reward at the goal, high_r of the paper.
         fail_reward: reward on entering the fail state, fail_r.
         step_reward: reward of every step, in addition.
-        reward_std: standard deviation of the noise on what end states pay, std_r.
+        reward_std: standard deviation of end states' rewards, std_r.
         reward_noise: ``additive``, N(c, reward_std) as in the paper, or ``multiplicative``, c (1 + N(0, reward_std)) as
             in the authors' implementation.
-        goal_change: (first, last): a goal lasts for a number of episodes drawn from first..last, then another is drawn
-            from all end states, the same one among them; per row, from the environment's own randomness. None: never.
-        extra_end_step: end as the authors' implementation does: an end state takes one more action, any one, and the
-            last observation of the episode is one of the home state. The reward still comes on entering the end state.
-        legacy_goal_change: count as the authors' implementation does: the first goal lasts one episode less than drawn.
-        swapped_branches: (path, (first, second)): at the decision state behind the branches of ``path``, () for the
-            first one, the decisions ``first`` < ``second`` lead to each other's branch. All states keep their places,
-            images and rewards, so that two tasks differ in one transition. None: every decision leads to its branch.
+        goal_change: (first, last): each row's goal lasts for a number of episodes drawn from first..last; the next is
+            drawn from all end states. None: forever.
+        extra_end_step: as in the authors' implementation, an end state takes one more action, and the episode's last
+            observation is of the home state. The reward still comes on entering the end state.
+        legacy_goal_change: as there, the first goal lasts one episode less than drawn.
+        swapped_branches: (path, (first, second)): at the decision state behind ``path`` the decisions ``first`` <
+            ``second`` lead to each other's branch. States keep places, images and rewards, so tasks differ in one
+            transition.
 
     Raises:
-        ValueError: names every field that breaks a rule.
+        ValueError: names all fields that break a rule.
 
     Example:
         >>> from dataclasses import replace
@@ -100,7 +100,6 @@ class Task:
     swapped_branches: tuple[tuple[int, ...], tuple[int, int]] | None = field(default=None, metadata={"added": True})
 
     resumes: ClassVar[bool] = True
-    """See `TaskLike`."""
 
     def __repr__(self) -> str:
         """Return graph, goal and images, in one line."""
@@ -177,7 +176,7 @@ class Task:
 
     @classmethod
     def make_env(cls, tasks: Sequence[Task], seed: int = 0, **settings: Any) -> Any:
-        """Return a `ctgraph_rl.CTGraphEnv` with one row for each of ``tasks``."""
+        """Return a `ctgraph_rl.CTGraphEnv` with a row per task."""
         return environment(Task)(tasks, seed, **settings)
 
     def _check_parts(self) -> None:
@@ -243,11 +242,11 @@ class Task:
 
     @property
     def swapped_node(self) -> int | None:
-        """Heap index of the decision state with swapped branches, None without."""
+        """Heap index of the decision state with swapped branches."""
         return None if self.swapped_branches is None else self.graph.node_at(self.swapped_branches[0])
 
     def decision_to(self, node: int) -> int:
-        """Return the decision, in 1..b, that leads from its parent to ``node``, any but the root 0."""
+        """Return the decision, in 1..b, from the parent of ``node`` > 0."""
         branch = self.graph.decision(node)
         swap = self.swapped_branches
         if swap is None or self.graph.parent(node) != self.swapped_node or branch not in swap[1]:
@@ -256,18 +255,18 @@ class Task:
 
     @property
     def goal_decisions(self) -> tuple[int, ...]:
-        """The d decisions that lead to the goal: its branches, unless one of them is swapped."""
+        """The d decisions to the goal: its branches, unless swapped."""
         nodes = self.graph.nodes_to(self.graph.node_at(self.goal))
         return tuple(map(self.decision_to, nodes[1:]))
 
     @property
     def goal_leaf(self) -> int:
-        """Number of the end state with the goal: its base-b digits are the decisions, the first one leading."""
+        """The goal's end state: its base-b digits are the branches, the first one leading."""
         return self.graph.leaf_of(self.goal)
 
     @takes_numbers
     def optimal_value(self, gamma: float) -> float:
-        """The best expected discounted return from the home state; gamma in [0, 1]."""
+        """The best expected discounted return; gamma in [0, 1]."""
         return values.optimal_value(self, gamma)
 
     @takes_numbers
@@ -280,22 +279,22 @@ class Task:
         return values.success_prob(self, policy)
 
     def memoryless_ceiling(self, deterministic: bool = False) -> float:
-        """The best mean return of a policy that remembers nothing; of needles, see `values.memoryless_ceiling`."""
+        """The best mean return without memory, by `values.memoryless_ceiling`."""
         return values.memoryless_ceiling(self, deterministic)
 
     @property
     def return_bounds(self) -> tuple[float, float]:
-        """The lowest and the highest return of an episode without the noise of rewards; infinite if unbounded."""
+        """Lowest and highest return of an episode, without noise; infinite if unbounded."""
         return values.return_bounds(self)
 
     @property
     def return_noise(self) -> float:
-        """The largest standard deviation that this noise gives to an episode's return."""
+        """Largest standard deviation of a return by the noise of rewards."""
         return values.return_noise(self)
 
     @property
     def is_deterministic(self) -> bool:
-        """Whether only actions decide an episode: a policy without chance plays the same one again and again."""
+        """Whether actions determine an episode."""
         x = self.observations
         ranges = ((x.wait_ids, x.unique_waits), (x.decision_ids, x.unique_decisions), (x.home_ids, False))
         drawn = any(first != last and not unique for (first, last), unique in ranges)
@@ -304,22 +303,22 @@ class Task:
 
     @property
     def observation_shape(self) -> tuple[int, ...]:
-        """The shape of an observation; a batch pads one-hot ones to the longest of its tasks."""
+        """Of one row; a batch pads one-hot vectors to its longest."""
         return tuple(self.images.shape)
 
     @property
     def num_actions(self) -> int:
-        """Waiting, and the b decisions."""
+        """b + 1: waiting, and the decisions."""
         return self.graph.branching_factor + 1
 
     @property
     def image_seed(self) -> int | None:
-        """The seed of a generated image set, None for sets without."""
+        """The seed of a generated image set."""
         return getattr(self.images, "seed", None)
 
     @property
     def label_parts(self) -> dict[str, str]:
-        """Parts of a task's label in tables: goal, depth, branching factor, wait probability, images and swap.
+        """Parts of the label in tables: goal, depth, branching factor, wait probability, images and swap.
 
         A swap is ``swap1.2at2`` for the branches 1 and 2 of the decision state behind branch 2.
         """
@@ -344,7 +343,7 @@ def are_graphs(tasks: Iterable[TaskLike]) -> TypeGuard[Sequence[Task]]:
 
 
 def ct_graphs(tasks: Sequence[TaskLike], what: str) -> Sequence[Task]:
-    """Return tasks that are all CT-graphs; ``what`` says in words what needs them.
+    """Return tasks that are all CT-graphs; ``what`` names what needs them.
 
     Raises:
         ValueError: for another kind.

@@ -6,11 +6,10 @@ may be 1. A wait state is left with probability 1 - p per wait; with V' the valu
 
     V(wait) = s + a (1 - p) V' + a p gamma V(wait) + (1 - a) fail_reward    if it waits with probability a,
 
-which is solved for V(wait). Rewards are those of `CTGraphEnv`: ``goal_reward`` times the share of ``reward_fn`` on
-entering an end state, ``fail_reward`` on entering the fail state, and s = ``step_reward`` for every step, one more of
-them after an end state where ``extra_end_step`` is set. The noise of rewards has mean 0 and changes nothing; a goal
-that changes stays unchanged. The environment rounds rewards to float32; here they are float64. Policies see observation
-ids, which is what they see of images where no two are equal and nothing varies on read.
+which is solved for V(wait). Rewards are those of `CTGraphEnv`, here in float64: ``goal_reward`` times the share of
+``reward_fn`` on entering an end state, ``fail_reward`` on entering the fail state, and s = ``step_reward`` for every
+step, one more after an end state with ``extra_end_step``. Noise has mean 0 and changes nothing; a goal that changes
+stays. Policies see observation ids, which equal images where no two are alike and nothing varies on read.
 """
 
 from __future__ import annotations
@@ -32,20 +31,19 @@ if TYPE_CHECKING:
     from ctgraph_rl.tasks.task import Task
 
 MAX_ENUMERATED_STATES = 2**21
-"""Largest graph whose states are visited one by one; larger needles have closed forms."""
+"""Largest graph whose states are visited singly; needles have closed forms."""
 
 SUM_TOLERANCE = 1e-6
-"""Largest distance of the sum of an observation's probabilities from 1, wide enough for float32 policies."""
+"""How far an observation's probabilities may sum from 1, for float32 policies."""
 
 
 def optimal_value(task: Task, gamma: float) -> float:
-    """The best expected discounted return from the home state, of any policy; deliberate failing included.
+    """The best expected discounted return from home; a policy may fail deliberately.
 
     For goal 1 and fail 0 of a needle: gamma^-1 (gamma^2 (1 - p) / (1 - gamma p))^(d + 1). Needles take O(d), other
     rewards visit every state.
 
     Args:
-        task: any task.
         gamma: discount, in [0, 1].
 
     Raises:
@@ -62,33 +60,32 @@ def optimal_value(task: Task, gamma: float) -> float:
 
 
 def worst_value(task: Task, gamma: float) -> float:
-    """The lowest expected discounted return from the home state, of any policy; arguments as `optimal_value`."""
+    """The lowest expected discounted return from home; arguments as `optimal_value`."""
     require(*fraction(gamma=gamma))
     return _value_at_home(smallest_tree(task, is_needle(task)), _WorstActions(task, gamma))
 
 
 def policy_value(task: Task, policy: Tensor, gamma: float = 1.0) -> float:
-    """The expected discounted return of a memoryless policy from the home state; with gamma = 1 the mean return.
+    """The expected discounted return of a memoryless policy from home.
 
-    Ids that a state draws are averaged, as a wait state draws one at every step. Needles take O(d) when neither
-    waits nor decisions are unique, other tasks visit every state.
+    Ids that a state draws are averaged. Needles take O(d) when neither waits nor decisions are unique; other tasks
+    visit every state.
 
     Args:
-        task: any task.
         policy: action probabilities per observation id, float [num_images, A] with A >= b + 1 and rows that sum to 1;
             actions above b fail, as in the environment. The rows of home, end and fail ids have no effect.
         gamma: discount, in [0, 1].
 
     Raises:
-        ValueError: for a policy of a wrong shape or dtype or without such rows, a gamma out of range, and more than
-            `MAX_ENUMERATED_STATES` states where every state has to be visited.
+        ValueError: for a policy of another shape, dtype or sum, a gamma out of range, and more than
+            `MAX_ENUMERATED_STATES` states where all have to be visited.
     """
     require(*fraction(gamma=gamma), *_policy_rules(task, policy))
     return _value_of_table(task, policy.detach().to("cpu", torch.float64), gamma)
 
 
 def success_prob(task: Task, policy: Tensor) -> float:
-    """The probability that a memoryless policy reaches the goal, whatever the rewards; arguments as `policy_value`."""
+    """The probability that a memoryless policy reaches the goal; arguments as `policy_value`."""
     paid = replace(task, reward_fn=Needle(), goal_reward=1.0, fail_reward=0.0, step_reward=0.0)
     return policy_value(paid, policy)
 
@@ -104,9 +101,9 @@ class Measures:
 
 
 def policy_measures(task: Task, policy: Tensor, gamma: float = 1.0) -> Measures:
-    """The expected return, success rate, end rate and length of a memoryless policy; arguments as `policy_value`.
+    """The exact measures of a memoryless policy; arguments as `policy_value`.
 
-    They are values of other rewards: 1 at the goal; 1 for an action that fails; 1 for each step.
+    They are values of other rewards: 1 at the goal; 1 for a failing action; 1 per step.
     """
     require(*fraction(gamma=gamma), *_policy_rules(task, policy))
     probs = policy.detach().to("cpu", torch.float64)
@@ -124,23 +121,23 @@ def policy_measures(task: Task, policy: Tensor, gamma: float = 1.0) -> Measures:
 def memoryless_ceiling(task: Task, deterministic: bool = False) -> float:
     """The best mean return of a policy that sees an observation id and remembers nothing.
 
-    Exact for needles with goal_reward > 0, fail_reward <= 0 and step_reward = 0. Waiting at wait states and deciding at
-    decision states then loses nothing. With c_a the number of times that the way to the goal takes decision a:
+    Exact for needles with goal_reward > 0, fail_reward <= 0 and step_reward = 0, where waiting at wait states and
+    deciding at decision states loses nothing. With c_a the number of times that the way to the goal takes decision a:
 
-    - unique decisions: every decision can be the right one; goal_reward.
-    - stochastic: decisions are drawn with the same probabilities q at every decision state, drawn ids or not, and
-      prod q_a^c_a is largest at q_a = c_a / d (Gibbs' inequality): goal_reward * prod (c_a / d)^c_a.
+    - unique decisions: every decision can be right; goal_reward.
+    - stochastic: decisions have the same probabilities q at every decision state, and prod q_a^c_a is largest at
+      q_a = c_a / d (Gibbs' inequality): goal_reward * prod (c_a / d)^c_a.
     - deterministic: the K ids of decision states are divided among the decisions, n_a ids each, so q_a = n_a / K:
       goal_reward * max prod (n_a / K)^c_a, which is 0 when the goal takes more than K different decisions.
 
-    A deterministic policy here is a function of the id: noise and rotation on read could serve it as dice.
+    A deterministic policy here is a function of the id; noise and rotation on read could serve it as dice.
 
     Args:
-        task: a task as above.
+        task: as above.
         deterministic: consider only policies that map an id to one action.
 
     Raises:
-        ValueError: for other rewards, saying which; their best policies may fail or seek several end states.
+        ValueError: names other rewards; their best policies may fail or seek several end states.
     """
     b = task.graph.branching_factor
     shares_ids = task.observations.legacy_index and task.observations.unique_decisions and b > 2
@@ -155,9 +152,9 @@ def memoryless_ceiling(task: Task, deterministic: bool = False) -> float:
 
 
 def return_bounds(task: Task) -> tuple[float, float]:
-    """Return the lowest and the highest return of an episode, undiscounted and without noise; infinite if unbounded.
+    """Return the lowest and highest return of an episode, undiscounted, without noise; infinite if unbounded.
 
-    The sum of a ``step_reward`` is not bounded, as an agent may wait on.
+    A ``step_reward`` has no bound, as an agent may wait on.
     """
     bounds = getattr(task.reward_fn, "bounds", None)
     if bounds is None:
@@ -168,7 +165,7 @@ def return_bounds(task: Task) -> tuple[float, float]:
 
 
 def return_noise(task: Task) -> float:
-    """Return the largest standard deviation that the noise of rewards gives to the return of an episode."""
+    """Return the largest standard deviation of a return by the noise of rewards."""
     if task.reward_std == 0 or task.reward_noise == "additive":
         return task.reward_std
     bounds = getattr(task.reward_fn, "bounds", None)
@@ -177,18 +174,15 @@ def return_noise(task: Task) -> float:
 
 
 def open_loop_ceiling(task: Task) -> float:
-    """The best mean return of a sequence of actions that is fixed before the episode and ignores all observations.
+    """The best mean return of a fixed sequence of actions that ignores observations.
 
-    With p = 0 episodes of a sequence are all alike, so the best one is optimal (section 3.3 of the paper). Else, for
-    needles with goal_reward > 0, fail_reward <= 0 and step_reward = 0: each of the d wait states before a decision must
-    be left at a step fixed before, best the first one, with probability 1 - p. The last wait state may take any time.
-    So the goal is reached with probability (1 - p)^d, and all other episodes fail.
-
-    Args:
-        task: a task as above.
+    With p = 0 the best one is optimal (section 3.3 of the paper). Else, for needles with goal_reward > 0, fail_reward
+    <= 0 and step_reward = 0: each of the d wait states before a decision must be left at a fixed step, best the first,
+    with probability 1 - p; the last may take any time. So the goal is reached with probability (1 - p)^d, and all other
+    episodes fail.
 
     Raises:
-        ValueError: for other rewards with p > 0, saying which.
+        ValueError: names other rewards, with p > 0.
     """
     if task.graph.wait_prob == 0:
         return optimal_value(task, 1.0)
@@ -198,10 +192,10 @@ def open_loop_ceiling(task: Task) -> float:
 
 
 def random_episode_length(task: Task) -> float:
-    """Return the mean steps of an episode of the uniformly random policy over the b + 1 actions of a task's graph.
+    """Return the mean steps of an episode under the uniformly random policy.
 
-    A wait state takes (b + 1) / (b + 1 - p) steps and is left for what it leads to with probability
-    w = (1 - p) / (b + 1 - p); a decision state leads on with probability c = b / (b + 1). Hence
+    A wait state takes (b + 1) / (b + 1 - p) steps and leads on with probability w = (1 - p) / (b + 1 - p), a decision
+    state with probability c = b / (b + 1). Hence
 
         1 + (b + 1) / (b + 1 - p) sum_{k=0..d} (w c)^k + w sum_{k=0..d-1} (w c)^k,
 
@@ -211,10 +205,10 @@ def random_episode_length(task: Task) -> float:
 
 
 def random_frames_to_goal(task: Task) -> float:
-    """Return the mean frames of that policy until it first reaches the goal, this step and failed episodes included.
+    """Return that policy's mean frames until it first reaches the goal, failed episodes included.
 
-    Episodes are independent, so this is `random_episode_length` over P_R (Wald's identity), less the step after the
-    goal with an ``extra_end_step``. A goal that changes alters nothing, as the policy prefers none. inf beyond floats.
+    This is `random_episode_length` over P_R (Wald's identity), less the step after the goal with an ``extra_end_step``,
+    also for a goal that changes. inf beyond floats.
 
     Example:
         >>> from ctgraph_rl.tasks.configurations import ct_su_b1
@@ -231,9 +225,8 @@ def random_frames_to_goal(task: Task) -> float:
 def _divided(num_ids: int, counts: list[int]) -> list[float]:
     """Shares n_a / K with sum n_a = K, integer n_a, that maximise prod (n_a / K)^c_a.
 
-    One id each and then, one by one, to the decision whose c_a ln n_a gains most: optimal since each of these terms is
-    concave in n_a, so gains only fall (Fox 1966, Operations Research 14). With fewer ids than decisions the product is
-    0 whatever they do.
+    One id each, then to the decision whose c_a ln n_a gains most: optimal, as each term is concave in n_a (Fox 1966,
+    Operations Research 14). With fewer ids than decisions the product is 0.
     """
     if num_ids < len(counts):
         return [0.0] * len(counts)
@@ -255,13 +248,12 @@ def _random_episode_length(task: Task) -> Fraction:
 
 
 def _value_of_table(task: Task, policy: Tensor, gamma: float) -> float:
-    """The value of a memoryless policy, float64 [num_images, A]."""
     shared = not (task.observations.unique_waits or task.observations.unique_decisions)
     return _value_at_home(smallest_tree(task, is_needle(task) and shared), _Memoryless(task, gamma, policy))
 
 
 def _value_at_home(tree: _EveryNode | _GoalPath, chooser: BestActions | _Memoryless) -> float:
-    """Backward induction from the end states to home, whose step is not rewarded and leads to the root's wait state."""
+    """Backward induction from the end states; home's step is not rewarded."""
     after_end = chooser.gamma * tree.task.step_reward if tree.task.extra_end_step else 0.0
     values = chooser.at_wait(tree.end_rewards() + after_end, tree.task.graph.depth)
     for level in reversed(range(tree.task.graph.depth)):
@@ -299,7 +291,7 @@ class _EveryNode:
         return task.goal_reward * share.to(torch.float64)
 
     def children(self, values: Tensor, level: int) -> Tensor:
-        """Values of level + 1 by parent and decision: float64 [b^level, b]."""
+        """By parent and decision: float64 [b^level, b]."""
         by_branch = values.view(-1, self.task.graph.branching_factor)
         swap = self.task.swapped_branches
         node = self.task.swapped_node
@@ -314,7 +306,7 @@ class _EveryNode:
 
 @dataclass(frozen=True)
 class _GoalPath:
-    """Two nodes per level: the one on the way to a needle, and any one off it; all of those are worth the same."""
+    """Two nodes per level: on the way to a needle, and any off it, which are worth the same."""
 
     task: Task
 
@@ -323,17 +315,17 @@ class _GoalPath:
         return torch.tensor([self.task.goal_reward, 0.0], dtype=torch.float64, device="cpu")
 
     def children(self, values: Tensor, level: int) -> Tensor:
-        """Values of level + 1 by parent and decision: float64 [2, b]."""
+        """By parent and decision: float64 [2, b]."""
         children = values[1].repeat(2, self.task.graph.branching_factor)
         children[0, self.task.goal_decisions[level] - 1] = values[0]
         return children
 
 
 class _GoalAndAnother(_GoalPath):
-    """With two of the b decisions, which are all that a best choice depends on."""
+    """With two of the b decisions, enough for a best choice."""
 
     def children(self, values: Tensor, level: int) -> Tensor:
-        """Values of level + 1 by parent, of the decision for the goal and of any other one: float64 [2, 2]."""
+        """By parent, for the goal's decision and any other: float64 [2, 2]."""
         return torch.stack([values, values[1].repeat(2)])
 
 
@@ -346,7 +338,7 @@ class BestActions:
 
     @property
     def failing(self) -> float:
-        """The reward of an action that fails."""
+        """The reward of failing."""
         return self.task.step_reward + self.task.fail_reward
 
     def waiting(self, arrival: Tensor) -> Tensor:
@@ -355,7 +347,7 @@ class BestActions:
         return (self.task.step_reward + (1 - p) * arrival) / (1 - self.gamma * p)
 
     def at_wait(self, arrival: Tensor, level: int) -> Tensor:
-        """Wait until it ends or fail; the choice that is best once stays best. float64, as ``arrival``."""
+        """Wait until it ends, or fail; the better stays better. float64, as ``arrival``."""
         return self.waiting(arrival).clamp_min(self.failing)
 
     def at_decision(self, children: Tensor, level: int) -> Tensor:
@@ -365,11 +357,9 @@ class BestActions:
 
 class _WorstActions(BestActions):
     def at_wait(self, arrival: Tensor, level: int) -> Tensor:
-        """Wait until it ends or fail; the choice that is worst once stays worst. float64, as ``arrival``."""
         return self.waiting(arrival).clamp_max(self.failing)
 
     def at_decision(self, children: Tensor, level: int) -> Tensor:
-        """Decide for the worst child or fail. float64 [n] of [n, b]."""
         return self.task.step_reward + (self.gamma * children.amin(-1)).clamp_max(self.task.fail_reward)
 
 
@@ -382,7 +372,7 @@ class _Memoryless:
     policy: Tensor
 
     def at_wait(self, arrival: Tensor, level: int) -> Tensor:
-        """The module's V(wait), solved. float64, as ``arrival``."""
+        """The module's V(wait), solved."""
         probs = self._action_probs(StateType.WAIT, level)
         p = self.task.graph.wait_prob
         waits = probs[:, WAIT_ACTION]
@@ -391,7 +381,7 @@ class _Memoryless:
         return leaves / (1 - self.gamma * p * waits)
 
     def at_decision(self, children: Tensor, level: int) -> Tensor:
-        """The mean over decisions and failing. float64 [n] of [n, b]."""
+        """The mean over decisions and failing."""
         probs = self._action_probs(StateType.DECISION, level)
         b = self.task.graph.branching_factor
         fails = probs[:, WAIT_ACTION] + probs[:, b + 1 :].sum(-1)
@@ -399,7 +389,7 @@ class _Memoryless:
         return self.task.step_reward + decided + fails * self.task.fail_reward
 
     def _action_probs(self, kind: StateType, level: int) -> Tensor:
-        """float64 [b^level, A] by node where ids are unique, else [1, A]: the mean over the ids that are drawn."""
+        """float64 [b^level, A] by node where ids are unique, else [1, A], the mean over ids."""
         b = self.task.graph.branching_factor
         first, last = self.task.observations.ids(kind)
         if not self.task.observations.is_unique(kind):
@@ -410,7 +400,7 @@ class _Memoryless:
 
 
 def is_needle(task: Task) -> bool:
-    """Return whether only the goal pays, so that a tree collapses to the path to it and one node off it."""
+    """Return whether only the goal pays."""
     return task.reward_fn == Needle()
 
 

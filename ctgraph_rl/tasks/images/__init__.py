@@ -1,7 +1,6 @@
-"""O, the images behind the observation ids: one frozen dataclass for each kind of image set.
+"""O, the images behind observation ids: a frozen dataclass for each kind of set.
 
-A user's own kind has what `ImageSet` names, and yaml reaches it through ``_target_``. The modules import the core;
-tasks, batches and figures use them.
+A user's own kind satisfies `ImageSet`, and yaml reaches it through ``_target_``.
 """
 
 from ctgraph_rl.tasks.images.generated import GroupedImages, PaperImages
@@ -12,7 +11,7 @@ from ctgraph_rl.tasks.images.one_hot import OneHot
 from ctgraph_rl.tasks.images.reference_images import ReferenceImages, ReferenceOneHot
 
 IMAGE_SETS = (PaperImages, GroupedImages, OneHot, ImageFile, ReferenceImages, ReferenceOneHot)
-"""Every image set of this package; JSON names them by their classes."""
+"""Every image set of this package."""
 
 __all__ = [
     "IMAGE_SETS",

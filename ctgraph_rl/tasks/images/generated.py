@@ -29,12 +29,12 @@ BLUEPRINT_LEVELS = (0, 127, WHITE)
 BLUEPRINT_ANGLES = (0, 30, 60)
 
 UNRELATED = (WHITE + 2) / (3 * (WHITE + 1))
-"""256/765: the expected distance of two images whose cells are independent and uniform over 0..254."""
+"""256/765: expected distance of two images with independent cells, uniform over 0..254."""
 
 _ROTATED_AT_ONCE = 4096
 
 _BYTES_OF_A_PIXEL, _BYTES_OF_A_BLUEPRINT, _BYTES_OF_A_CELL = 8, 800, 64
-"""Memory that making images takes for each candidate's pixels and blueprint, and for each cell of grouped images."""
+"""Memory in use while images are made."""
 
 _GROUPED_BLOCK = 1 << 27  # the upper half of the image stream's blocks; `PaperImages` uses block 0
 
@@ -43,11 +43,10 @@ _GROUPED_BLOCK = 1 << 27  # the upper half of the image stream's blocks; `PaperI
 class PaperImages(SquareImages):
     """The paper's image sets: random blueprints, upscaled and rotated, no image twice.
 
-    Image k is the k-th different one in the sequence of a seed, so a longer set begins with the shorter one.
-    A blueprint has 4x4 cells of {0, 1, 2}, shown as 0, 127 and 254; it is scaled up and rotated by 0, 30 or 60 degrees.
+    A blueprint has 4x4 cells of {0, 1, 2}, shown as 0, 127 and 254, and is rotated by 0, 30 or 60 degrees. Longer sets
+    of a seed begin with the shorter ones.
 
     Args:
-        num_images: number of images.
         seed: the image seed, in [0, 2**63).
         size: r, side of an image in pixels; a multiple of 4.
     """
@@ -77,16 +76,14 @@ class GroupedImages(SquareImages):
 
     Ids follow the groups: ``groups=(1, 1, 4, 8)`` makes id 0 the first group, id 1 the second, ids 2..5 the third. The
     distance of two images is their mean absolute pixel difference as a share of 254. An image has c x c cells, each
-    uniform over 0..254. A group's blueprint is a common blueprint with a share s_g of its cells redrawn, an image is
+    uniform over 0..254. A group's blueprint is a common blueprint with a share s_g of its cells redrawn; an image is
     its group's blueprint with a share s_i redrawn. Cells that are not shared differ by D = 256/765 on average, hence
 
         within = D (1 - (1 - s_i)^2),    between = D (1 - (1 - s_i)^2 (1 - s_g)^2)
 
-    are the expected distances of two images of one group and of two groups, and the shares follow from them. The
-    values of a seed are in `distances`; more cells come closer. A share s of n cells is s n of them rounded at random
-    up or down, so at least one is redrawn when within >= D (1 - (1 - 1 / c^2)^2), the least value allowed.
-
-    No image occurs twice: one drawn before is left out. Longer groups begin with the shorter ones.
+    are the expected distances within and between groups. The values of a seed are in `distances`; more cells come
+    closer. A share s of n cells is s n, rounded up or down at random; so the least ``within`` is
+    D (1 - (1 - 1 / c^2)^2), for one cell. No image occurs twice. Longer groups begin with the shorter ones.
 
     Args:
         groups: number of images of each group.
@@ -97,7 +94,7 @@ class GroupedImages(SquareImages):
         cells: c, cells along a side.
 
     Raises:
-        ValueError: for distances out of reach and more images than the cells keep apart.
+        ValueError: for distances out of reach, or more images than the cells keep apart.
     """
 
     groups: tuple[int, ...]
@@ -126,7 +123,6 @@ class GroupedImages(SquareImages):
         object.__setattr__(self, "between", float(self.between))
 
     def _distance_rules(self) -> list[Rule]:
-        """Return the rules for reachable distances, up to that of unrelated images while cells are in question."""
         lowest = UNRELATED * (1 - (1 - 1 / self.cells**2) ** 2) if is_int(self.cells, 1) else 0.0
         within_ok = is_real(self.within, lowest, UNRELATED)
         reach = f"[{math.ceil(lowest * 1e5) / 1e5:.5f}, {UNRELATED:.5f}]"
@@ -146,7 +142,7 @@ class GroupedImages(SquareImages):
 
     @property
     def group_of(self) -> tuple[int, ...]:
-        """The group of each id, numbered from 0: what `distances` asks for."""
+        """The group of each id, from 0, as `distances` takes it."""
         found: list[int] = []
         for group, size in enumerate(self.groups):
             found += [group] * size
@@ -172,7 +168,7 @@ def _paper_images(image_set: PaperImages) -> Tensor:
 
 
 def _blueprints(seed: int, count: int) -> Tensor:
-    """int64 [count, 17]: 16 cells of a blueprint in {0, 1, 2} and one of three angles, by counter."""
+    """int64 [count, 17]: 16 cells in {0, 1, 2}, and one of three angles."""
     tick = torch.arange(count, device="cpu")
     words = draw(tick.new_tensor(seed), tick.new_tensor(0), tick, STREAM_IMAGES)
     powers = 3 ** torch.arange(BLUEPRINT_SIZE**2 + 1, device="cpu")
@@ -191,7 +187,7 @@ def _render(blueprints: Tensor, size: int) -> Tensor:
 
 @lru_cache(maxsize=16)
 def _grouped_images(image_set: GroupedImages) -> Tensor:
-    """Each group's first candidates that repeat none of any group, where candidate k of all groups precedes k + 1."""
+    """Each group's first candidates that repeat no image; candidate k of all groups precedes k + 1."""
     groups = image_set.groups
     cells = image_set.cells
     candidates = max(groups)
@@ -208,7 +204,7 @@ def _grouped_images(image_set: GroupedImages) -> Tensor:
 
 
 def _candidates(image_set: GroupedImages, count: int) -> Tensor:
-    """int64 [count, G, c * c]: levels of the first candidates of each group."""
+    """int64 [count, G, c * c]: each group's first candidates, as levels."""
     seed = image_set.seed
     cells = image_set.cells
     kept_by_image = 1 - image_set.within / UNRELATED  # (1 - s_i)^2
@@ -223,14 +219,14 @@ def _candidates(image_set: GroupedImages, count: int) -> Tensor:
 
 
 def _words(seed: int, row: Tensor, tick: Tensor, cells: int) -> Tensor:
-    """At least 2 c * c + 1 random words per element, in a last dimension."""
+    """At least 2 c * c + 1 random words per element, last."""
     blocks = _GROUPED_BLOCK + torch.arange((2 * cells**2 + 1 + 3) // 4, device="cpu")
     words = draw(row.new_tensor(seed), row.unsqueeze(-1), tick.unsqueeze(-1), STREAM_IMAGES, blocks)
     return torch.stack(words, -1).flatten(-2)
 
 
 def _redraw(levels: Tensor, share: float, words: Tensor) -> Tensor:
-    """Levels [..., n] with a share of them redrawn, each with this probability: share * n, rounded at random."""
+    """Levels [..., n] with share * n of them, rounded at random, redrawn."""
     n = levels.shape[-1]
     count = (words[..., 2 * n : 2 * n + 1] + int(share * n * 2**32)) >> 32
     rank = words[..., :n].argsort(dim=-1, stable=True).argsort(dim=-1)

@@ -18,20 +18,19 @@ from ctgraph_rl.tasks.images.image_set import resize
 
 @dataclass(frozen=True)
 class ImageFile:
-    """A user's images: a .npy file that holds a uint8 array [classes, instances, r, r].
+    """A user's images: a .npy file with a uint8 array [classes, instances, r, r].
 
     An id is a class; every observation shows an instance drawn uniformly. ``ImageFile.of(path)`` fills in the hash.
-    Two sets are equal when their content is: the path only says where this machine keeps it. The environment's bank
-    takes classes * instances * (read_rotation + 1) * r * r bytes.
+    Sets are equal when their content is, wherever the file is. The environment's bank takes
+    classes * instances * (read_rotation + 1) * r * r bytes.
 
     Args:
         path: the file; relative to the working directory.
-        sha256: SHA-256 of the file, 64 hex digits.
-        size: side of an observation in pixels: a multiple of r repeats pixels, a divisor averages blocks of them. None
-            is r.
+        sha256: of the file, 64 hex digits.
+        size: side of an observation in pixels: a multiple of r repeats pixels, a divisor averages blocks; None: r.
 
     Raises:
-        ValueError: for a missing file, another content than the hash says, and an array of another kind.
+        ValueError: for a missing file, another content than the hash says, or another kind of array.
     """
 
     path: str = field(compare=False)
@@ -55,7 +54,7 @@ class ImageFile:
 
     @classmethod
     def of(cls, path: str | Path, size: int | None = None) -> ImageFile:
-        """The images of a file with the hash that it has now."""
+        """The images of a file, with its present hash."""
         _read(str(path))
         return cls(str(path), _sha256(str(path)), size)
 
@@ -66,7 +65,7 @@ class ImageFile:
 
     @property
     def images(self) -> Tensor:
-        """uint8 [classes * instances, r, r], the instances of a class in a row; read from the file again."""
+        """uint8 [classes * instances, r, r], class by class; read from the file again."""
         array = _read(self.path)
         require(self._hash_rule())
         return resize(torch.from_numpy(np.array(array, order="C")).flatten(0, 1), self.shape[-1])
@@ -96,6 +95,6 @@ def _sha256(path: str) -> str:
 
 @lru_cache(maxsize=64)
 def _sha256_of_version(path: str, size: int, changed: int) -> str:
-    """SHA-256 of a file, read once as long as its size and time of change stay."""
+    """SHA-256 of a file, read again when its size or time of change differs."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

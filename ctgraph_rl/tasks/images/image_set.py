@@ -1,4 +1,4 @@
-"""The protocol of image sets, what any code may ask of one, and the base of sets of square images."""
+"""The protocol of image sets, and the base of sets of square images."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ WHITE = 254
 class ImageSet(Protocol):
     """The images behind the observation ids: a frozen dataclass, equal and hashable by value.
 
-    An id has ``num_variants`` images. Every observation shows one of them, drawn uniformly together with its rotation.
-    Two more attributes are optional: ``white``, the brightest level (254 if missing), and ``cue_element``, True for
-    vectors whose last element is free to show the reward.
+    Every observation shows one of an id's ``num_variants`` images, drawn uniformly with its rotation. Two attributes
+    are optional: ``white``, the brightest level (254 if missing), and ``cue_element``, True for vectors whose last
+    element is free to show the reward.
     """
 
     @property
     def num_images(self) -> int:
-        """Number of ids it can show."""
+        """Number of ids."""
         ...
 
     @property
     def num_variants(self) -> int:
-        """Number of images of each id."""
+        """Images of each id."""
         ...
 
     @property
@@ -37,25 +37,25 @@ class ImageSet(Protocol):
         ...
 
     def bank(self, read_rotation: int) -> Tensor:
-        """All that can be shown, uint8 [num_images * num_variants * (read_rotation + 1), *shape].
+        """All images, uint8 [num_images * num_variants * (read_rotation + 1), *shape].
 
-        Variant v of an id, rotated by a degrees, is in row (id * num_variants + v) * (read_rotation + 1) + a.
+        Variant v of an id, rotated by a degrees, is row (id * num_variants + v) * (read_rotation + 1) + a.
         """
         ...
 
 
 def has_cue_element(images: ImageSet) -> bool:
-    """Whether observations are vectors whose last element shows the reward of end states."""
+    """Whether observations are vectors whose last element shows the end's reward."""
     return getattr(images, "cue_element", False)
 
 
 def white_level(images: ImageSet) -> float:
-    """The brightest level of an image set."""
+    """The brightest level of a set."""
     return getattr(images, "white", WHITE)
 
 
 class SquareImages:
-    """Base of sets of one square image per id, of which a subclass gives ``size`` and ``images``."""
+    """Base of sets of one square image per id; a subclass has ``size`` and ``images``."""
 
     size: int
     num_variants = 1
@@ -76,7 +76,7 @@ class SquareImages:
 
 
 def resize(images: Tensor, size: int) -> Tensor:
-    """Return images [n, r, r] with every pixel repeated, or blocks of pixels averaged and rounded, half up."""
+    """Return images [n, r, r] with pixels repeated, or blocks averaged and rounded half up."""
     side = images.shape[-1]
     if size >= side:
         return images.repeat_interleave(size // side, dim=1).repeat_interleave(size // side, dim=2)

@@ -13,7 +13,7 @@ from ctgraph_rl.tasks.images.image_set import WHITE
 
 
 class Distances(NamedTuple):
-    """Mean absolute pixel differences as a share of 254; nan where there is no pair to compare."""
+    """Mean absolute pixel differences as a share of 254; nan without a pair."""
 
     within: float  # mean over all pairs of different images of one group
     between: float  # mean over all pairs of images of different groups
@@ -21,14 +21,14 @@ class Distances(NamedTuple):
 
 
 def distances(images: Tensor, groups: Sequence[int]) -> Distances:
-    """Measure how far apart images are within and between groups.
+    """Return the distances of images within and between groups.
 
     Per pixel, the sum of |x - y| over the pairs of two groups is the sum over levels of A (m - B) + B (n - A), where A
     and B count each group's images up to the level and n and m count all.
 
     Args:
         images: uint8 [n, r, r].
-        groups: the group of each image, numbered from 0 without a gap.
+        groups: the group of each image, from 0 without a gap.
     """
     numbers = sorted(set(groups))
     require(
@@ -51,7 +51,7 @@ def distances(images: Tensor, groups: Sequence[int]) -> Distances:
 
 
 def _counts_up_to_level(images: Tensor) -> Tensor:
-    """int64 [pixels * 256]: how many images have at most a level at a pixel."""
+    """int64 [pixels * 256]: images with at most a level at a pixel."""
     pixels = images.flatten(1).to(torch.int64)
     count = pixels.shape[1]
     place = pixels + 256 * torch.arange(count, device=images.device)
@@ -59,14 +59,14 @@ def _counts_up_to_level(images: Tensor) -> Tensor:
 
 
 def count_repeats(images: Tensor) -> int:
-    """Count how many of uint8 [n, r, r] images equal an earlier one."""
+    """Return how many of uint8 [n, r, r] images equal an earlier one."""
     fits = images.dtype == torch.uint8 and images.ndim == 3 and len(images) > 0
     require((fits, f"images must be uint8 [n, r, r] with n >= 1, got {images.dtype} {list(images.shape)}"))
     return len(images) - len(first_of_each(images))
 
 
 def first_of_each(images: Tensor) -> Tensor:
-    """Return the positions of the images that do not repeat an earlier one, in order."""
+    """Return the positions of images that repeat no earlier one, in order."""
     _, group = torch.unique(images.flatten(1), dim=0, return_inverse=True)
     positions = torch.arange(len(images), device="cpu")
     none = torch.full_like(group[: int(group.max()) + 1], len(images))

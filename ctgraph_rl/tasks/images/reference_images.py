@@ -18,17 +18,15 @@ from ctgraph_rl.tasks.images.image_set import WHITE, SquareImages
 from ctgraph_rl.tasks.images.one_hot import OneHot
 
 MAX_SEED = 2**32 - 1
-"""Seeds of the authors' implementation are those of ``numpy.random.RandomState``."""
+"""As ``numpy.random.RandomState`` has it."""
 
 _ANGLES = 359
-"""Image sets are rotated by 0..358 degrees."""
 
 _PIXELS_PER_CELL = 3
 
 _ROTATED_AT_ONCE = 256
 
 _BYTES_OF_A_PIXEL = 12
-"""Memory that making images takes."""
 
 
 @dataclass(frozen=True)
@@ -36,14 +34,13 @@ class ReferenceImages(SquareImages):
     """The image sets of the authors' implementation: 12 x 12 random blueprints at any angle, repeats kept.
 
     An image is 4 x 4 cells of {0, 1, 2}, each 3 x 3 pixels of that many halves of the brightest level, 254 - noise. It
-    is rotated by 0..358 degrees (bilinear, black outside) and truncated to whole levels. The sets equal recorded ones
-    pixel by pixel. Longer sets begin with the shorter ones; `count_repeats` tells how many images equal an earlier one.
+    is rotated by 0..358 degrees (bilinear, black outside) and truncated to whole levels, equal to recorded sets. Longer
+    sets begin with the shorter ones.
 
     Args:
-        num_images: number of images.
         seed: the image seed, in [0, 2**32).
-        noise: ``noise_on_read`` of the configuration file, in [0, 254]. Here it lowers the brightest level; the noise
-            on read itself is ``read_noise`` of `Observations`, without the digits after the point.
+        noise: ``noise_on_read`` of the configuration file, in [0, 254]. It lowers the brightest level; its integer part
+            is also ``read_noise`` of `Observations`.
     """
 
     num_images: int
@@ -63,7 +60,7 @@ class ReferenceImages(SquareImages):
 
     @property
     def white(self) -> float:
-        """The brightness of the goal's reward cue; the brightest level is this without the digits after the point."""
+        """The brightness of the goal's reward cue; its integer part is the brightest level."""
         return WHITE - self.noise
 
     @property
@@ -86,10 +83,8 @@ class ReferenceImages(SquareImages):
 class ReferenceOneHot(OneHot):
     """The 1D observations of the authors' implementation: 254 at the id's place, and a last element for the reward cue.
 
-    The vector has K + 1 elements here, where the authors' implementation has an array of shape (K + 1, 1).
-
     Args:
-        num_images: K, the number of ids.
+        num_images: K, the number of ids; vectors have K + 1 elements.
     """
 
     white = WHITE
@@ -101,7 +96,7 @@ class ReferenceOneHot(OneHot):
         return (self.num_images + 1,)
 
     def bank(self, read_rotation: int) -> Tensor:
-        """uint8 [K, K + 1]: 254 times the identity, and a column of zeros; a vector has no rotation."""
+        """uint8 [K, K + 1]: 254 times the identity, and a column of zeros."""
         return WHITE * torch.eye(self.num_images, self.num_images + 1, dtype=torch.uint8, device="cpu")
 
 
@@ -133,8 +128,7 @@ def _blueprints(seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
 def _rotate(images: np.ndarray, degrees: int) -> np.ndarray:
     """Rotate as scikit-image does, counter-clockwise about the centre, bilinear, black outside; float64 [n, r, r].
 
-    Truncation to whole levels shows the last bit of a sum, so this has the order of operations that recorded sets have,
-    where `images.rotate` has rounded weights.
+    The order of operations is that of recorded sets: truncation shows the last bit of a sum.
     """
     y, x = _sources(images.shape[-1], degrees)
     border = images.shape[-1] // 2  # no pixel comes from farther outside
@@ -156,7 +150,7 @@ def _rotate(images: np.ndarray, degrees: int) -> np.ndarray:
 
 @lru_cache(maxsize=_ANGLES)
 def _sources(size: int, degrees: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns in the image that the pixels of the rotated one come from, float64 [r, r] each."""
+    """Rows and columns that the rotated image's pixels come from, float64 [r, r] each."""
     angle = math.radians(degrees)
     centre = (size - 1) / 2
     cos = math.cos(angle)
@@ -168,5 +162,5 @@ def _sources(size: int, degrees: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _fused(a: float, b: float, c: float) -> float:
-    """a b + c, rounded once, as the matrix products that recorded sets come from."""
+    """a b + c, rounded once, as in recorded sets."""
     return float(Fraction(a) * Fraction(b) + Fraction(c))

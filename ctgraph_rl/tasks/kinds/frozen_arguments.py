@@ -10,7 +10,7 @@ from ctgraph_rl.checks import plain, require
 
 
 class ListArgument(tuple[Any, ...]):
-    """A list. JSON and fingerprints show it as a list."""
+    """A list."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class TupleArgument:
 
 @dataclass(frozen=True)
 class DictArgument:
-    """A dict, as pairs of key and value in the order as written."""
+    """A dict, as pairs in the order written."""
 
     items: tuple[tuple[Any, Any], ...]
 
@@ -31,7 +31,7 @@ HELD = (ListArgument, TupleArgument, DictArgument)
 
 
 def freeze(value: Any) -> Any:
-    """Return an argument as a frozen value; a frozen one unchanged.
+    """Return an argument as a frozen value.
 
     Raises:
         ValueError: for values that JSON has no form for.
@@ -57,7 +57,7 @@ def _key(key: Any) -> Any:
 
 
 def thaw(value: Any) -> Any:
-    """Return the argument that `freeze` was given, new lists and dicts at each call."""
+    """Return the argument of `freeze`, new lists and dicts at each call."""
     if isinstance(value, ListArgument):
         return [thaw(item) for item in value]
     if isinstance(value, TupleArgument):
@@ -90,10 +90,10 @@ def from_json(content: Any) -> Any:
 
 
 def by_name(what: str, arguments: Any) -> tuple[tuple[str, Any], ...]:
-    """Return arguments as pairs of name and frozen value, in the order of their names.
+    """Return arguments as pairs of name and frozen value, by name.
 
     Args:
-        what: has the arguments, the beginning of the message.
+        what: has the arguments; begins the message.
         arguments: a mapping, or pairs.
 
     Raises:

@@ -1,7 +1,4 @@
-"""What environments of Gymnasium return and take, read at one place: observations, rewards, ends and actions.
-
-An environment may return whatever holds numbers: of Python, NumPy, torch or ``Decimal``, in lists and arrays.
-"""
+"""Observations, rewards, ends and actions of Gymnasium's environments, read at one place."""
 
 from __future__ import annotations
 
@@ -14,27 +11,27 @@ from numpy.typing import NDArray
 from ctgraph_rl.checks import plain, require
 
 CHANNELS = (1, 3, 4)
-"""Numbers of channels by which an axis is known to be that of channels: grey, colours, and colours with alpha."""
+"""Lengths of an axis of channels: grey, colours, and colours with alpha."""
 
 LARGEST = float(np.finfo(np.float32).max)
 
 
 def is_discrete(space: Any) -> bool:
-    """Return whether a space is of integers, Gymnasium's ``Discrete``."""
+    """Return whether a space is Gymnasium's ``Discrete``."""
     from gymnasium.spaces import Discrete
 
     return isinstance(space, Discrete)
 
 
 def is_box(space: Any) -> bool:
-    """Return whether a space is of arrays, Gymnasium's ``Box``."""
+    """Return whether a space is Gymnasium's ``Box``."""
     from gymnasium.spaces import Box
 
     return isinstance(space, Box)
 
 
 class Taken(NamedTuple):
-    """What an environment returned from a step."""
+    """What a step returned."""
 
     observation: NDArray[Any]
     reward: float
@@ -43,22 +40,21 @@ class Taken(NamedTuple):
 
 
 class ObservationForm:
-    """How the observations of a space are shown to a network.
+    """How a network sees the observations of a space.
 
     - Integers, ``Discrete``: one-hot, uint8 [n].
-    - A ``Box`` of one dimension: a vector, float32 [n], or uint8 [n] where the space is uint8.
+    - A ``Box`` of one dimension: a vector, uint8 [n] if the space is uint8, else float32 [n].
     - A uint8 ``Box`` of two dimensions: a grey image [height, width], shown as [1, height, width].
-    - Of three: an image with channels, shown channels first. They are the first or the last axis: the one of length 1,
-      3 or 4. Where both or neither has such a length, ``channels`` says it.
-    - Of four: frames of images with channels, [frames, ...], as Gymnasium's ``FrameStackObservation`` makes them.
-      The channels of all frames are shown as channels, the oldest frame first.
+    - Of three: an image with channels, shown channels first. These are the first or the last axis: the one of length 1,
+      3 or 4; else ``channels`` says which.
+    - Of four: frames [frames, ...] of images with channels, as by ``FrameStackObservation``. All are shown as channels,
+      the oldest frame first.
 
     Args:
-        space: of Gymnasium.
         channels: where an image has its channels, ``first`` or ``last``; None: by the rule above.
 
     Raises:
-        ValueError: for other spaces, with the wrapper to add, and images whose channels are not clear.
+        ValueError: for other spaces, with the wrapper to add, and images whose channels are unclear.
     """
 
     def __init__(self, space: Any, channels: str | None = None) -> None:
@@ -93,7 +89,7 @@ class ObservationForm:
             self.shape = (math.prod(sizes[:-2]), *sizes[-2:])
 
     def read(self, observation: Any) -> NDArray[Any]:
-        """Return an observation in the form in which it is shown.
+        """Return an observation in its shown form.
 
         Raises:
             ValueError: for what the space does not hold.
@@ -164,11 +160,11 @@ class ActionForm:
 
     @property
     def form(self) -> str:
-        """The form in words; environments of one form take the same actions."""
+        """The form in words; equal forms take the same actions."""
         return str(self.space) if self.num_actions is None else f"Discrete({self.num_actions})"
 
     def read(self, actions: NDArray[Any]) -> NDArray[Any]:
-        """Return a copy of actions of rows, [rows, *shape].
+        """Return a copy of the rows' actions, [rows, *shape].
 
         Raises:
             ValueError: for actions of another shape, and integers that are no action.
@@ -187,7 +183,7 @@ class ActionForm:
         return actions
 
     def give(self, action: Any) -> Any:
-        """Return an action of a row as the environment takes it: in the space's own numbers, a copy."""
+        """Return a copy of a row's action in the space's own numbers."""
         if self.num_actions is not None:
             return self.space.dtype.type(int(action) + int(self.space.start))
         dtype = self.space.dtype
@@ -201,16 +197,16 @@ class ActionForm:
 
     @property
     def ends(self) -> NDArray[np.float32]:
-        """The lowest and the highest action of a ``Box``, [2, *shape]."""
+        """Lowest and highest action of a ``Box``, [2, *shape]."""
         with np.errstate(over="ignore"):
             return np.stack([self.space.low, self.space.high]).astype(np.float32)
 
 
 def read_number(value: Any, what: str) -> float:
-    """Return a number, whatever holds it.
+    """Return a number of Python, NumPy or torch as a float.
 
     Raises:
-        ValueError: for what is none.
+        ValueError: for anything else.
         FloatingPointError: for one that is not finite as float32.
     """
     number = _only_item(value)
@@ -227,7 +223,7 @@ def _read_flag(value: Any, what: str) -> bool:
 
 
 def _only_item(value: Any) -> Any:
-    """Return what an array or list of one holds as Python's own; anything else unchanged."""
+    """Return the only item of an array or list; else the value unchanged."""
     value = plain(value)
     while isinstance(value, (list, tuple)) and len(value) == 1:
         value = value[0]
@@ -235,7 +231,6 @@ def _only_item(value: Any) -> Any:
 
 
 def _as_array(value: Any) -> NDArray[Any]:
-    """Return numbers as an array; of dtype object for what has none."""
     try:
         array = np.asarray(value)
     except (RuntimeError, TypeError, ValueError):  # such as a tensor of a GPU, or one with a gradient
@@ -249,7 +244,7 @@ def _as_array(value: Any) -> NDArray[Any]:
 
 
 def _is_shown_rule(space: Any) -> tuple[bool, str]:
-    """Return the rule that a space is of vectors or images, with the wrapper to add."""
+    """Return the rule that a space has vectors or images, with the wrapper to add."""
     shown = is_box(space) and (len(space.shape) == 1 or (len(space.shape) in (2, 3, 4) and space.dtype == np.uint8))
     if getattr(space, "is_np_flattenable", False):
         fix = "add the wrapper gymnasium.wrappers:FlattenObservation, or one of your own"

@@ -20,47 +20,44 @@ if TYPE_CHECKING:
     import gymnasium
 
 WITH_TABLE = ("gymnasium.envs.toy_text.frozen_lake", "gymnasium.envs.toy_text.cliffwalking")
-"""Modules of environments that step only by their table of transitions ``P``."""
+"""Modules of environments that step only by their table ``P``."""
 
 ALREADY = {
     "max_episode_steps": "give it as GymTask(max_episode_steps=...)",
     "disable_env_checker": "the checker is always off",
     "id": "it is the first argument of GymTask",
 }
-"""Arguments of ``gymnasium.make`` that an environment is not given by ``kwargs``, and why."""
+"""Arguments of ``gymnasium.make`` that ``kwargs`` cannot give, and why."""
 
 
 @dataclass(frozen=True, eq=False)
 class GymTask:
     """An environment of Gymnasium: any id with a time limit whose observations are images, vectors or integers.
 
-    Images are uint8 and are shown channels first, vectors as float32, and integers as one-hot; see
-    `ctgraph_rl.tasks.kinds.gym_spaces.ObservationForm`. Actions are integers; our agents refuse continuous ones.
-    Nothing else is needed for a learner of one's own.
+    `ctgraph_rl.tasks.kinds.gym_spaces.ObservationForm` says how observations are shown. Actions are integers; our
+    agents refuse continuous ones.
 
-    Every episode begins with ``reset(seed=...)``. Its seed follows from the run's seed, the row and the number of the
-    row's episode, so that a run repeats. A stopped run resumes by the seeds of the present episodes and their actions.
+    The seed of each ``reset(seed=...)`` follows from the run's seed, the row and the number of its episode, so that
+    runs repeat. A stopped run resumes by replaying the present episodes.
 
-    Two tasks are equal if all arguments are, and of the same types: ``True``, ``1`` and ``1.0`` differ, and a list
-    differs from a tuple.
+    Two tasks are equal if all arguments are, types included: ``True`` differs from ``1``, a list from a tuple.
 
     Args:
-        id: of the environment; ``module:Name-v0`` imports the module that registers it first.
-        kwargs: arguments of the environment by name: numbers, texts, true or false, None, and lists, tuples and dicts
-            of them. They arrive as written; arrays arrive as lists.
-        wrappers: wrap the environment one after the other: classes, or functions of an environment, by ``module:name``.
-            One with arguments is a pair, such as ``("gymnasium.wrappers:FrameStackObservation", {"stack_size": 4})``.
-        max_episode_steps: the time limit, which truncates an episode; None: that of the id or of a wrapper
-            ``TimeLimit``.
+        id: of the environment; ``module:Name-v0`` imports the module first.
+        kwargs: arguments of the environment by name: numbers, texts, booleans, None, and lists, tuples and dicts of
+            them. Arrays arrive as lists.
+        wrappers: applied in order: classes, or functions of an environment, by ``module:name``. One with arguments is a
+            pair, such as ``("gymnasium.wrappers:FrameStackObservation", {"stack_size": 4})``.
+        max_episode_steps: truncates an episode; None: the limit of the id or of a wrapper ``TimeLimit``.
         label: short name in tables; None: the id with its arguments.
-        return_range: the lowest and the highest return of an episode, where you know them and the best policy always
-            gets the highest. None: computed within the time limit for environments of `WITH_TABLE`, and else unknown.
-        repeats: whether an episode repeats with its seed and actions. If not, a stopped run resumes from its last
-            announced block.
+        return_range: lowest and highest return of an episode, if the best policy always gets the highest. None:
+            computed within the time limit for environments of `WITH_TABLE`, else unknown.
+        repeats: whether seed and actions determine an episode. If not, a stopped run resumes from its last announced
+            block.
         channels: where images have their channels, ``first`` or ``last``; None: found by the length of the axis.
 
     Raises:
-        ValueError: for a value that breaks a rule; what the environment itself refuses is found when it is first made.
+        ValueError: for a value that breaks a rule. The environment's own refusals come when it is first made.
 
     Example:
         >>> GymTask("FrozenLake-v1", {"is_slippery": False}).optimal_value(1.0)
@@ -118,22 +115,22 @@ class GymTask:
 
     @property
     def resumes(self) -> bool:
-        """Whether an environment of it can be saved, see `TaskLike`: by replaying its episodes."""
+        """Whether a saved environment can continue, by replaying its episodes."""
         return self.repeats
 
     @property
     def observation_shape(self) -> tuple[int, ...]:
-        """The shape of an observation that is shown."""
+        """The shape of a shown observation."""
         return make_forms(self)[0].shape
 
     @property
     def num_actions(self) -> int | None:
-        """The number of actions; None where they are continuous."""
+        """None where actions are continuous."""
         return make_forms(self)[1].num_actions
 
     @property
     def modules(self) -> tuple[str, ...]:
-        """The modules that are imported where its environment is made."""
+        """Modules to import where its environment is made."""
         import gymnasium
 
         module, _, name = self.id.rpartition(":")
@@ -145,11 +142,11 @@ class GymTask:
 
     @classmethod
     def make_env(cls, tasks: Sequence[GymTask], seed: int = 0, **settings: Any) -> Any:
-        """Return a `ctgraph_rl.batch.gym_env.GymEnv` with one row for each of ``tasks``."""
+        """Return a `ctgraph_rl.batch.gym_env.GymEnv` with a row per task."""
         return environment(GymTask)(tasks, seed, **settings)
 
     def make(self) -> gymnasium.Env[Any, Any]:
-        """Return the environment, wrapped.
+        """Return the wrapped environment.
 
         Raises:
             ValueError: if it cannot be made, has no time limit, or shows what networks cannot read.
@@ -179,7 +176,7 @@ class GymTask:
         return env
 
     def optimal_value(self, gamma: float) -> float:
-        """The best mean return within the time limit, of a policy that sees state and time; discounted by ``gamma``.
+        """The best mean discounted return within the time limit, of a policy that sees state and time.
 
         Raises:
             ValueError: where it is not known.
@@ -195,7 +192,7 @@ class GymTask:
 
     @property
     def return_bounds(self) -> tuple[float, float]:
-        """The lowest and the highest return of an episode, which chance can make better than the best mean return.
+        """Lowest and highest return of an episode; chance may exceed the best mean return.
 
         Raises:
             ValueError: where they are not known.
@@ -206,7 +203,7 @@ class GymTask:
 
 
 def time_limit(env: Any) -> int | None:
-    """Return the shortest time limit among the wrappers of an environment; None without one."""
+    """Return the shortest time limit among an environment's wrappers, or None."""
     from gymnasium import Wrapper
     from gymnasium.wrappers import TimeLimit
 
@@ -219,7 +216,7 @@ def time_limit(env: Any) -> int | None:
 
 
 def registered(task: GymTask) -> tuple[Any, ...]:
-    """Return what is registered under a task's id now, for caches: a notebook registers an id again."""
+    """Return what an id's registration is now, as a key of caches."""
     from gymnasium import registry
 
     spec = registry.get(task.id.rpartition(":")[2])
@@ -227,7 +224,7 @@ def registered(task: GymTask) -> tuple[Any, ...]:
 
 
 def make_forms(task: GymTask) -> tuple[ObservationForm, ActionForm]:
-    """Return how a task's observations are shown and its actions given."""
+    """Return the forms of a task's observations and actions."""
     return _make_forms(task, registered(task))
 
 
@@ -286,7 +283,7 @@ def _read_table(task: GymTask, key: Any) -> _Table:
 
 
 def _extreme_return(task: GymTask, choose: Callable[..., Any]) -> float:
-    """Return the best or the worst return that an episode can have: as above, with any outcome that is possible."""
+    """Return the best or worst possible return of an episode."""
     table = _table(task)
     impossible = table.probs == 0
     values = np.zeros(len(table.initial))
@@ -318,7 +315,7 @@ def _frozen_wrapper(wrapper: Any, rule: str) -> Any:
 
 
 def require_wrapper_classes(task: GymTask) -> None:
-    """Refuse wrappers that a file of others must not name: functions, and classes that write files or open windows.
+    """Refuse wrappers that others' files must not name: functions, and classes that write files or open windows.
 
     Raises:
         ValueError: for a wrapper that is no class of `gymnasium.Wrapper`, or one of `gymnasium.wrappers` that writes.

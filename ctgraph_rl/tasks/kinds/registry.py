@@ -1,4 +1,4 @@
-"""The environments of the kinds of tasks of this package, which stand above tasks and are added by `ctgraph_rl.env`."""
+"""Makers of environments by kind of task, filled by `ctgraph_rl.env`."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from collections.abc import Callable
 from typing import Any
 
 ENVIRONMENTS: dict[type, Callable[..., Any]] = {}
-"""What makes the environment of a kind of tasks, with the arguments of `TaskLike.make_env`."""
+"""Take the arguments of `TaskLike.make_env`."""
 
 
 def environment(kind: type) -> Callable[..., Any]:
-    """Return what makes the environment of a kind of tasks.
+    """Return the maker of environments for a kind of tasks.
 
     Raises:
         ImportError: if `ctgraph_rl.env` is not imported.

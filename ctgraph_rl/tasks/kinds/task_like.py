@@ -13,29 +13,28 @@ from ctgraph_rl.checks import Rule, as_tuple, require
 class TaskLike(Hashable, Protocol):
     """A task of any kind: a frozen dataclass with the four members below, equal and hashable by value.
 
-    Its fields are plain values, tuples of them, or such dataclasses again. So the fingerprint of a curriculum covers
-    them and JSON holds them. `ctgraph_rl.Task` is the first kind, `ctgraph_rl.GymTask` the second.
-    All tasks of a curriculum are of one kind, as one environment holds them. Runs and evaluations close it.
+    Its fields are plain values, tuples of them, or such dataclasses again: fingerprints cover them and JSON holds them.
+    `ctgraph_rl.Task` is the first kind, `ctgraph_rl.GymTask` the second. All tasks of a curriculum are of one kind.
 
-    Further members are optional. ``resumes`` says that the environment can be saved: a new one continues with the same
-    bits after ``load_state_dict(state_dict())``. Without it a stopped run resumes from its last announced block.
-    ``optimal_value(gamma)``, the best mean return, and ``return_bounds``, the lowest and the highest return of an
-    episode, serve metrics and figures. They raise a ``ValueError`` with the reason where they are not known.
+    Further members are optional. With ``resumes`` the environment can be saved: a new one continues with the same bits
+    after ``load_state_dict(state_dict())``. Without it a stopped run resumes from its last announced block.
+    ``optimal_value(gamma)``, the best mean return, and ``return_bounds``, the lowest and highest return of an episode,
+    serve metrics and figures; they raise a ``ValueError`` with the reason where unknown.
     """
 
     @property
     def label_parts(self) -> Mapping[str, str]:
-        """Parts of the task's short name. A curriculum shows the first one, and those in which its tasks differ."""
+        """Parts of the short name. A curriculum shows the first, and those in which its tasks differ."""
         ...
 
     @property
     def observation_shape(self) -> tuple[int, ...]:
-        """The shape of one row's observation."""
+        """Of one row."""
         ...
 
     @property
     def num_actions(self) -> int | None:
-        """The number of actions; None where they are continuous."""
+        """None where actions are continuous."""
         ...
 
     @classmethod
@@ -49,36 +48,34 @@ class TaskLike(Hashable, Protocol):
         task_ids: Mapping[Any, int] | None = None,
         num_task_ids: int | None = None,
     ) -> Any:
-        """Return a TorchRL ``EnvBase`` with one row for each of ``tasks``, ``batch_size=[len(tasks)]``.
+        """Return a TorchRL ``EnvBase`` with one row per task, ``batch_size=[len(tasks)]``, which the caller closes.
 
         Its data have ``observation``, ``is_init``, ``step_count`` and ``episode_reward``, the last three [N, 1], beside
-        ``reward``, ``done`` and ``terminated``; TorchRL's ``InitTracker``, ``StepCounter`` and ``RewardSum`` write them
-        where an environment does not. Beside those of an ``EnvBase`` it has the member
-        ``set_tasks(tasks, at_episode_end=False)``, which gives each row a task of the pool: before the next reset of
-        all rows, or when the row's episode ends.
+        ``reward``, ``done`` and ``terminated``; TorchRL's ``InitTracker``, ``StepCounter`` and ``RewardSum`` can write
+        them. A further method, ``set_tasks(tasks, at_episode_end=False)``, gives each row a task of the pool: before
+        the next reset of all rows, or when the row's episode ends.
 
         Args:
             tasks: one for each row.
             seed: decides all that is random.
             task_pool: all tasks that ``set_tasks`` may be given; None: ``tasks``.
             device: where the tensors live.
-            task_ids: the id of each task. Observations then have ``task_id``, the id as one-hot, uint8
-                [N, num_task_ids], zeros for a task without one.
+            task_ids: the id of each task. Observations then have ``task_id``, one-hot, uint8 [N, num_task_ids], zeros
+                for a task without one.
             num_task_ids: the length of ``task_id``.
         """
         ...
 
 
 MEMBERS = ("label_parts", "observation_shape", "num_actions", "make_env")
-"""What a task needs beside being a frozen dataclass."""
 
 
 def are_tasks(name: str, values: object) -> list[Rule]:
-    """Return the rules that values are tasks of one kind, without asking a task for anything.
+    """Return the rules that values are tasks of one kind, asking no task for anything.
 
     Args:
-        name: what needs them, the beginning of the message.
-        values: a tuple, or what is none.
+        name: what needs them; begins the message.
+        values: checked to be a tuple.
     """
     if not isinstance(values, tuple) or not all(map(_is_value, values)):
         fix = f"a task is a Task, a GymTask or a frozen dataclass with {', '.join(MEMBERS)}"
@@ -93,7 +90,7 @@ def are_tasks(name: str, values: object) -> list[Rule]:
 
 
 def most_actions(tasks: Iterable[TaskLike]) -> int:
-    """Return the largest number of actions of tasks.
+    """Return the largest number of actions.
 
     Raises:
         ValueError: for continuous ones.
@@ -109,7 +106,7 @@ def _is_value(value: object) -> bool:
 
 
 def is_kind(kind: type) -> bool:
-    """Return whether a class is a kind of tasks."""
+    """Return whether tasks can be of a class."""
     return is_dataclass(kind) and _task_rule(kind)[0]
 
 
@@ -123,7 +120,7 @@ def _task_rule(kind: type) -> Rule:
 
 
 def require_tasks(values: Iterable[TaskLike]) -> tuple[Any, ...]:
-    """Return tasks of one kind, at least one.
+    """Return at least one task, all of one kind.
 
     Raises:
         ValueError: for anything else.
@@ -138,7 +135,7 @@ def require_tasks(values: Iterable[TaskLike]) -> tuple[Any, ...]:
 
 
 def close_env(env: Any) -> None:
-    """Close an environment. One that fails is named, and raises nothing: a run's results or first error come first."""
+    """Close an environment. A failure is printed, not raised: results or a first error come first."""
     try:
         if hasattr(env, "close"):
             env.close()
