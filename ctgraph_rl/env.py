@@ -19,6 +19,7 @@ from ctgraph_rl.checks import require, require_all, takes_numbers, true_or_false
 from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import NO_LEAF, RowState, Shown
+from ctgraph_rl.core.goal import Goal
 from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.core.tree import Swap, is_done
 from ctgraph_rl.draw.pixels import render
@@ -75,7 +76,7 @@ class CTGraphEnv(EnvBase):
 
     Example:
         >>> from ctgraph_rl.tasks.configurations import ct_su_b1
-        >>> env = CTGraphEnv([ct_su_b1(goal=(1, 1)), ct_su_b1(goal=(1, 2))], seed=0)
+        >>> env = CTGraphEnv([ct_su_b1(goal="1.1"), ct_su_b1(goal="1.2")], seed=0)
         >>> env.rollout(10)["observation"].shape[2:]
         torch.Size([1, 12, 12])
     """
@@ -134,7 +135,7 @@ class CTGraphEnv(EnvBase):
         """Let rows change between tasks from episode to episode: see `Rows.switch_tasks`."""
         self.rows.switch_tasks(tasks, switch, at_episode_end)
 
-    def set_goals(self, goals: Iterable[Sequence[int]] | Tensor) -> None:
+    def set_goals(self, goals: Iterable[Goal] | Tensor) -> None:
         """Give every row a goal: see `Rows.set_goals`. The outcome of an episode follows from the goal at its end."""
         self.rows.set_goals(goals)
 

@@ -109,7 +109,7 @@ def dick2020_pair(num_frames: int = 51_200, one_hot: bool = True) -> Curriculum:
 
     Section 4.2 of the CT-graph paper: the graphs "had a single variation in the transition matrix". No configuration
     was published. Here observations are as in CT-SU-B1, but each end state has its own, so that the change is seen. In
-    the second task the branches behind the first one are swapped: (1, 2) reaches the same goal instead of (1, 1).
+    the second task the branches behind the first one are swapped: 1.2 reaches the same goal instead of 1.1.
 
     Args:
         num_frames: frames per task.

@@ -356,7 +356,7 @@ def interleave(*sequences: OneOrMore) -> Tasks:
 
     Example:
         >>> from ctgraph_rl.tasks.configurations import ct_su_b1
-        >>> a, b, c = (ct_su_b1(goal=goal) for goal in ((1, 1), (1, 2), (2, 1)))
+        >>> a, b, c = (ct_su_b1(goal=goal) for goal in ("1.1", "1.2", "2.1"))
         >>> [task.goal for task in interleave((a, b), c)]
         [(1, 1), (2, 1), (1, 2)]
     """

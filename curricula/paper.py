@@ -79,8 +79,8 @@ def configured(configuration: str, image_seed: int = 1) -> Task:
 def one_goal(configuration: str, image_seed: int = 1) -> Task:
     """The configuration's task for curricula with a single goal.
 
-    Where all decision states look alike the goal is (1, 2), which a deterministic policy without memory never reaches;
-    else it is (1, 1, ...).
+    Where all decision states look alike the goal is 1.2, which a deterministic policy without memory never reaches;
+    else it is 1.1 or 1.1.1.
     """
     task = configured(configuration, image_seed)
     return task if KINDS[configuration] == "full" else replace(task, goal=(1, 2))
@@ -124,7 +124,7 @@ def instances(
 def depth_growth(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
     """Depth 2 to 5 with nested goals: is a path reused whose end is the way to the next goal?
 
-    The deepest goal is (1, 2, 1, 2, 2), and each shallower goal begins it. All graphs use the deepest one's images, so
+    The deepest goal is 1.2.1.2.2, and each shallower goal begins it. All graphs use the deepest one's images, so
     no image changes its role.
 
     Args:

@@ -1,6 +1,6 @@
 """Common parts of the published sequences: the labs' environments, task ids and evaluation; and those lost.
 
-The labs write a goal as a string of 0 and 1, and a task with its image seed before it: ``2:110`` is the goal (2, 2, 1)
+The labs write a goal as a string of 0 and 1, and a task with its image seed before it: ``2:110`` is the goal 2.2.1
 with the images of seed 2. Environments are as `Task.from_json` reads their files.
 """
 
@@ -70,7 +70,7 @@ def environment(
 
 
 def goal_of(path: str) -> tuple[int, ...]:
-    """The goal of a path: ``011`` as (1, 2, 2)."""
+    """The goal of a path: ``011`` as 1.2.2."""
     return tuple(int(branch) + 1 for branch in path)
 
 

@@ -150,7 +150,7 @@ def performance_matrix(make: Callable[[Symbols], Predictor], tasks: Sequence[Tas
         >>> from baselines.models.table_model import TableModel
         >>> from ctgraph_rl.metrics import forgetting
         >>> from ctgraph_rl.tasks.configurations import ct_fo_b1
-        >>> tasks = [ct_fo_b1(goal=(1, 1)), ct_fo_b1(goal=(2, 2))]
+        >>> tasks = [ct_fo_b1(goal="1.1"), ct_fo_b1(goal="2.2")]
         >>> round(forgetting(performance_matrix(TableModel, tasks), [[0], [1]]).value, 2) > 0
         True
     """

@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import are_ints, as_tuple, is_int, plain, require, require_all
+from ctgraph_rl.checks import are_ints, is_int, plain, require, require_all
 from ctgraph_rl.core import philox
+from ctgraph_rl.core.goal import Goal
 from ctgraph_rl.tasks.protocol import MOST_IDS
 from ctgraph_rl.tasks.switch import Switch
 from ctgraph_rl.tasks.task import Task
@@ -49,8 +50,8 @@ def find_numbers(pool: Iterable[Task], tasks: Iterable[Task]) -> list[int]:
     return [number[task] for task in tasks]
 
 
-def find_leaves(tasks: Sequence[Task], goals: Iterable[Sequence[int]]) -> list[int]:
-    """Return the numbers of the end states that goals, sequences of decisions, lead to.
+def find_leaves(tasks: Sequence[Task], goals: Iterable[Goal]) -> list[int]:
+    """Return the numbers of the end states that goals lead to.
 
     Raises:
         ValueError: if there is not one goal per row, or a goal is no end state of its row's tree.
@@ -58,9 +59,10 @@ def find_leaves(tasks: Sequence[Task], goals: Iterable[Sequence[int]]) -> list[i
     goals = list(goals)
     n = len(tasks)
     require((len(goals) == n, f"set_goals needs one goal per row, {n} in all, got {len(goals)}"))
-    flat = [goal for goal in goals if not isinstance(as_tuple(goal), tuple)]
-    require((not flat, f"a goal must be its decisions, such as (1, 1), got {flat[:3]}; give one for each row"))
-    return [replace(task, goal=tuple(goal)).goal_leaf for task, goal in zip(tasks, goals, strict=True)]
+    numbers = [goal for goal in goals if is_int(goal)]  # decisions or end states?
+    fix = 'write decisions as "1" or "1.2", and numbers of end states as an int64 tensor'
+    require((not numbers, f"goals must be decisions, got {numbers[:3]}: {fix}"))
+    return [replace(task, goal=goal).goal_leaf for task, goal in zip(tasks, goals, strict=True)]
 
 
 EpisodePlace = tuple[Tensor, Tensor, Tensor]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
 import torch
@@ -16,6 +16,7 @@ from ctgraph_rl.checks import Rule, TakesNumbers, is_int, plain, require, requir
 from ctgraph_rl.core import dynamics, philox
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import RowState, Shown
+from ctgraph_rl.core.goal import Goal
 from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.core.kernel import is_available, is_traced
 from ctgraph_rl.core.row_params import RowParams
@@ -237,11 +238,12 @@ class Rows(TakesNumbers, nn.Module):
             self.goal_leaf = torch.where(changed, self.tables.row_goals, self.goal_leaf)
             self.episodes_left = torch.where(changed, 0, self.episodes_left)
 
-    def set_goals(self, goals: Iterable[Sequence[int]] | Tensor) -> None:
+    def set_goals(self, goals: Iterable[Goal] | Tensor) -> None:
         """Give every row a goal, also within an episode; `set_tasks` and `set_seed` restore the tasks' goals.
 
         Args:
-            goals: decisions in 1..b for every row, also as [N, d]; or numbers of end states, int64 [N].
+            goals: decisions in 1..b for every row, such as ``"1.2"``, also as [N, d]; or numbers of end states,
+                int64 [N].
 
         Raises:
             ValueError: if a goal is not one of its row's tree.

@@ -42,7 +42,7 @@ def counting_ceiling(task: Task) -> float:
 
     Example:
         >>> from ctgraph_rl.tasks.configurations import ct_posr_b1
-        >>> counting_ceiling(ct_posr_b1(goal=(1, 2)))
+        >>> counting_ceiling(ct_posr_b1(goal="1.2"))
         0.75
     """
     rule = "the ceiling of counting is for a goal that pays 1 and no other reward"

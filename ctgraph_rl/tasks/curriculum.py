@@ -51,7 +51,7 @@ class Curriculum:
     Example:
         >>> from ctgraph_rl import Block, Evaluation
         >>> from ctgraph_rl.tasks.configurations import ct_su_b1
-        >>> blocks = tuple(Block(ct_su_b1(goal=goal), num_frames=10_000) for goal in ((1, 1), (2, 2)))
+        >>> blocks = tuple(Block(ct_su_b1(goal=goal), num_frames=10_000) for goal in ("1.1", "2.2"))
         >>> mine = Curriculum("mine", 1, "this page", blocks, Evaluation(num_episodes=10))
         >>> mine.num_frames, mine.labels
         (20000, ('goal1.1', 'goal2.2'))

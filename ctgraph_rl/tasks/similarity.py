@@ -46,7 +46,7 @@ ActionSets = dict[tuple[StateType, int], list[int]]
 def shared_decisions(tasks: Sequence[Task]) -> Tensor:
     """The first decisions that two goals share, relative to the shorter goal; float64 [T, T].
 
-    (1, 2, 1) and (1, 2) share 1.0, (1, 2, 1) and (1, 1, 1) share 1/3.
+    1.2.1 and 1.2 share 1.0, 1.2.1 and 1.1.1 share 1/3.
 
     Example:
         >>> import curricula

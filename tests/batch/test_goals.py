@@ -106,7 +106,7 @@ def test_goals_can_be_set_in_the_middle_of_an_episode():
     for _ in range(3):
         act(env, optimal(env))
 
-    env.set_goals([(1, 2), (1, 1)])
+    env.set_goals(["1.2", (1, 1)])
     for _ in range(3):
         last = act(env, optimal(env))
 
@@ -125,6 +125,8 @@ def test_goals_can_be_set_as_numbers_of_end_states():
     ("goals", "message"),
     [
         ([(1, 3), (1, 1)], "goal must be 2 decisions in 1..2"),
+        (["1.3", "1.1"], "goal must be 2 decisions in 1..2, such as 1.1, got 1.3"),
+        ([1, 2], r"goals must be decisions, got \[1, 2\]: write decisions as"),
         ([(1, 1)], "one goal per row"),
         (torch.tensor([0, 4]), r"goals must be end states of the rows' trees, got \[4\]"),
         (torch.tensor([0.0, 1.0]), "goals must be int64 of shape"),

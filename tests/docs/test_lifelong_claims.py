@@ -41,14 +41,14 @@ def _(t):
 
 @reads("masks_ct8_md")
 def _(t):
-    """Mask BLC solves `0000` in 17 seeds, `0001` in ten, `00000` in four and `00001` in none."""
+    """Mask BLC solves `1.1.1.1` in 17 seeds, `1.1.1.2` in ten, `1.1.1.1.1` in four and `1.1.1.1.2` in none."""
     return t.own("mask_blc").sum(0)[4:].tolist() == [17, 10, 4, 0]
 
 
 @reads("masks_ct8_md")
 def _(t):
-    """Fine-tuned PPO solves `00000` in eight and `00001` in two of 20 seeds, because the goals are nested: after `000`
-    it solves `00`, `000`, `0000` and `00000` in every seed."""
+    """Fine-tuned PPO solves `1.1.1.1.1` in eight and `1.1.1.1.2` in two of 20 seeds, because the goals are nested: after `1.1.1`
+    it solves `1.1`, `1.1.1`, `1.1.1.1` and `1.1.1.1.1` in every seed."""
     own = t.own("finetune")
     both = own[:, 6:].all(1).sum() == 2  # as README says
     nested = t.ends("finetune")[:, 2, [0, 2, 4, 6]].all()
@@ -136,15 +136,15 @@ def _(t):
 
 @reads("masks_ct12")
 def _(t):
-    """Fine-tuned PPO ends with `11` and `111` in nine seeds and with nothing in one."""
-    return sorted(map(sorted, t.names(t.known("finetune")))) == [[], *9 * [["11", "111"]]]
+    """Fine-tuned PPO ends with `2.2` and `2.2.2` in nine seeds and with nothing in one."""
+    return sorted(map(sorted, t.names(t.known("finetune")))) == [[], *9 * [["2.2", "2.2.2"]]]
 
 
 @reads("masks_ct12")
 def _(t):
-    """Mask LC misses `110` in two seeds and `111` in one of these, and keeps the others."""
+    """Mask LC misses `2.2.1` in two seeds and `2.2.2` in one of these, and keeps the others."""
     missed = [goals for goals in t.names(~t.own("mask_lc")) if goals]
-    return missed == [{"110", "111"}, {"110"}] and keep_all(t, "mask_lc")
+    return missed == [{"2.2.1", "2.2.2"}, {"2.2.1"}] and keep_all(t, "mask_lc")
 
 
 @reads("masks_ct12")
@@ -198,7 +198,7 @@ def test_the_papers_claims_compare_means_over_curricula_with_a_pair_for_each_see
     from studies.lifelong import pairs
 
     measured = {("mask_lc", name, "0"): value for name, value in zip(pairs.MASKS, (0.25, 0.5, 1.0), strict=True)}
-    measured |= {("mask_lc", pairs.MASKS[0], "10"): 1.0}
+    measured |= {("mask_lc", pairs.MASKS[0], "2.1"): 1.0}
     rows = PAGE.read_text(encoding="utf-8").split("### The paper's claims")[1].split("\n## ")[0].split("\n| ")[2:]
 
     assert pairs.over_curricula(measured) == {("mask_lc", "0"): 1.75 / 3}
