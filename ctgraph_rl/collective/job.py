@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from typing_extensions import override
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.collective.summary import COLLECTIVE, FILES, describe_collective, read_collective, write_summary
@@ -36,7 +37,7 @@ from ctgraph_rl.runs.job import (
     prepare,
     train_experts,
 )
-from ctgraph_rl.runs.session import Failures, RunMember, Session, mark_failure
+from ctgraph_rl.runs.session import Failures, RunMember, Session, SessionCoupling, mark_failure
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 LONG_ID = 1000
@@ -97,7 +98,7 @@ def _learn(session: Session, cfg: Any, cells: Sequence[ConfigAndPath], exchange:
         session.learn(members, Exchanging(cfg, exchange, run_dir, checkpoints))
 
 
-class Exchanging:
+class Exchanging(SessionCoupling):
     """A coupling of learners that exchange messages by `learn_collective`.
 
     Args:
@@ -114,12 +115,14 @@ class Exchanging:
         self.checkpoints = checkpoints
         self.saved: RunState | None = None
 
+    @override
     def resume(self, members: Sequence[RunMember]) -> Sequence[RunState | None]:
         """Return the states to resume from."""
         self.checkpoints.tidy()
         self.saved = self.checkpoints.newest()
         return [None] * len(members) if self.saved is None else self.saved["members"]
 
+    @override
     def learn(
         self, members: Sequence[RunMember], saved: Sequence[RunState | None], console: Console | None
     ) -> Failures:
@@ -142,6 +145,7 @@ class Exchanging:
             log.close()
         return {}
 
+    @override
     def end(self, members: Sequence[RunMember], failed: Failures) -> None:
         """Write the collective's results."""
         write_summary(self.run_dir)

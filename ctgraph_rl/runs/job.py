@@ -62,11 +62,6 @@ ConfigAndPath = tuple[Any, Path]
 def build(cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None = None) -> RunMember:
     """Build the objects of a configuration, the agent last, which decides the state of torch's global generator.
 
-    Args:
-        cfg: the composed configuration.
-        run_dir: the directory of its run.
-        interrupt: notices when the process is asked to stop.
-
     Raises:
         ValueError: for values out of range, and parts that do not go together.
     """
@@ -142,13 +137,13 @@ def train_experts(
     """Find or train the single-task experts of the runs of several seeds, those of a task as one batch.
 
     Args:
-        configs: the configuration of each seed.
-        curriculum: what they learn.
-        interrupt: notices when the process is asked to stop.
-        only: the position of the one task whose experts are needed, from 1; None: all.
+        configs: of each seed.
+        curriculum: of their runs.
+        interrupt: ends waiting for other processes.
+        only: the one task whose experts are needed, from 1; None: all.
 
     Returns:
-        The experts of each seed, and the error of each seed with an expert that failed, which then has none.
+        The experts of each seed; the error of each seed with an expert that failed, which has none.
     """
     by_seed = {cfg.seed: cfg for cfg in configs}
     first = configs[0]
@@ -187,12 +182,7 @@ def train_experts(
 
 
 def learn_experts(configs: Sequence[Any], task: int) -> None:
-    """Find or train the single-task experts of seeds for one task, from 1, as one batch.
-
-    Args:
-        configs: the configuration of each seed.
-        task: position of the task in the curriculum.
-    """
+    """Find or train the single-task experts of seeds for one task, from 1, as one batch."""
     first = configs[0]
     prepare_torch(first)
     with Interrupt() as interrupt:
@@ -280,10 +270,7 @@ def prepare_torch(cfg: DictConfig) -> None:
 def run_job(cfg: DictConfig, run_dir: Path, built: RunMember | None = None) -> None:
     """Run a configuration in an existing directory, unless its results are there; a read-only one may hold them.
 
-    Args:
-        cfg: the composed configuration.
-        run_dir: the directory.
-        built: its objects, if they were just built.
+    ``built`` are its objects, if they were just built.
 
     Raises:
         ValueError: before any work, for a value out of range.
@@ -320,12 +307,12 @@ def learn(
     Args:
         session: has the locks.
         cells: one, or all that learn as one batch.
-        interrupt: notices when the process is asked to stop.
+        interrupt: for checkpoints.
         built: the objects of one of them, if they were just built.
-        together: whether they learn as one batch, which a single one may, too.
+        together: learn as one batch, of one seed, too.
 
     Returns:
-        The error of each seed that failed, itself or one of its single-task experts.
+        The error of each seed that failed, or that has an expert that failed.
     """
     members: dict[int, RunMember] = {}
     for cfg, run_dir in cells:
@@ -360,9 +347,7 @@ def learn(
 def run_as_one(cells: Sequence[ConfigAndPath], built: RunMember | None = None) -> None:
     """Run those that are not finished, as one batch; a seed that fails stops no other.
 
-    Args:
-        cells: the configuration of each seed, and its existing directory.
-        built: the objects of one of them, if they were just built.
+    ``built`` are the objects of one, if they were just built.
 
     Raises:
         RuntimeError: if seeds have failed.
@@ -392,14 +377,7 @@ def run_as_one(cells: Sequence[ConfigAndPath], built: RunMember | None = None) -
 
 
 def run_seeds(cfg: Any, run_dir: Path) -> list[Path]:
-    """Run a configuration with each of the ``seeds`` that a sweep lists, in its directory.
-
-    Args:
-        cfg: the composed configuration, with the first seed.
-        run_dir: its directory.
-
-    Returns:
-        The directories of all seeds.
+    """Run a configuration of the first seed with each of its ``seeds``, which a sweep lists; return all directories.
 
     Raises:
         ValueError: before any work, for a value out of range.
@@ -462,12 +440,7 @@ def is_finished(cfg: DictConfig, run_dir: Path) -> bool:
 def changed_code(cfg: DictConfig, run_dir: Path, known: dict[str, NamedValues]) -> tuple[list[str], bool]:
     """Return in words what code has changed since a configuration was run in a directory, and whether some is unknown.
 
-    A run that was stopped before its first checkpoint has nothing that a change could concern.
-
-    Args:
-        cfg: the composed configuration.
-        run_dir: the directory.
-        known: the code of configurations that differ from this one in what does not matter; it is added to.
+    Nothing has for a run that was stopped before its first checkpoint. ``known`` keeps the code of configurations.
     """
     about = first_line(run_dir) if holds_results(run_dir) else None
     if about is None:

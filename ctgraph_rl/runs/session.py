@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import torch
+from typing_extensions import override
 
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule, require
 from ctgraph_rl.disk import append_line, sync_folder, sync_folders, write_whole
@@ -225,7 +226,7 @@ class Session:
         return failed
 
 
-class OneBatch:
+class OneBatch(SessionCoupling):
     """A coupling of seeds that learn one curriculum as one batch, or of a single run.
 
     Runs that were stopped are resumed from the last checkpoint that all have, and end as if they had never stopped.
@@ -238,8 +239,8 @@ class OneBatch:
     def __init__(self, device: torch.device) -> None:
         self.device = device
 
+    @override
     def resume(self, members: Sequence[RunMember]) -> Sequence[RunState | None]:
-        """See `SessionCoupling`; more than the first update of a run is never lost."""
         curriculum = members[0].curriculum
         agent = members[0].agent
         check_rows(curriculum, agent.num_envs)
@@ -265,10 +266,10 @@ class OneBatch:
             print(f"note: {terminal_text(each.run_dir)} begins again: {why}", file=sys.stderr)
         return [None] * len(members)
 
+    @override
     def learn(
         self, members: Sequence[RunMember], saved: Sequence[RunState | None], console: Console | None
     ) -> Failures:
-        """See `SessionCoupling`."""
         curriculum = members[0].curriculum
         states = [state for state in saved if state is not None] or None
         done = 0 if states is None else states[0]["frames"]
@@ -293,8 +294,9 @@ class OneBatch:
         self._had_failed = [number for number, state in enumerate(states or ()) if "failed" in state]
         return lockstep.failed
 
+    @override
     def end(self, members: Sequence[RunMember], failed: Failures) -> None:
-        """Remove the checkpoints of a seed that failed; last, as others could not be resumed beside one without."""
+        # others could not be resumed beside one without checkpoints
         for number in failed:
             if members[number].together or number in self._had_failed:
                 members[number].checkpoints.clear()
@@ -316,11 +318,7 @@ def _all_begun(member: RunMember, others: Sequence[RunMember]) -> Rule:
 
 
 def why_agents_learn_alone(agent: object, device: torch.device) -> str | None:
-    """Return why agents like this one cannot learn as one batch of seeds on a device; None if they can.
-
-    Raises:
-        ValueError: see `check_packages`.
-    """
+    """Return why agents like this one cannot learn as one batch of seeds on a device; None if they can."""
     check_packages()
     if device.type == "cpu":
         return import_module("baselines.update.seeds").why_not_together(agent)
@@ -328,11 +326,7 @@ def why_agents_learn_alone(agent: object, device: torch.device) -> str | None:
 
 
 def agents_together(agents: Sequence[object], generators: Sequence[object], device: torch.device) -> Any:
-    """Return the `ctgraph_rl.learn.loop.Group` of agents on a device, each with what it draws from.
-
-    Raises:
-        ValueError: see `check_packages`.
-    """
+    """Return the `ctgraph_rl.learn.loop.Group` of agents on a device, each with what it draws from."""
     check_packages()
     if device.type == "cpu":
         return import_module("baselines.update.seeds").SeedGroup(agents, generators)
