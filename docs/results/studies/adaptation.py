@@ -7,8 +7,11 @@ from math import fsum
 from pathlib import Path
 from statistics import fmean
 from string import Template
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from ctgraph_rl.report import statistics
+from ctgraph_rl.report.intervals import Bounds
+from ctgraph_rl.report.statistics import Comparison
 from studies import adaptation_swap
 from studies.raw import (
     HERE,
@@ -22,10 +25,6 @@ from studies.raw import (
     table,
 )
 from studies.verdicts import seeds_that_would_do
-
-if TYPE_CHECKING:
-    from ctgraph_rl.report.intervals import Bounds
-    from ctgraph_rl.report.statistics import Comparison
 
 NAME = "adaptation"
 PAGE = HERE / "adaptation.md"
@@ -83,8 +82,6 @@ def regret(lines: Raw) -> float:
 
 def bounds_of_regret(lines: Raw) -> Bounds:
     """Return the regret of episodes that all succeed by chance, below 0, and of an agent that never succeeds."""
-    from ctgraph_rl.report.intervals import Bounds
-
     best = fsum(float(line["best_search"]) for line in lines)
     return Bounds(best - len(lines), best)
 
@@ -146,8 +143,6 @@ Runs = dict[tuple[str, ...], dict[tuple[str, ...], Raw]]
 
 def against(found: Runs, first: tuple[str, ...], second: tuple[str, ...]) -> Comparison:
     """Compare the success after adaptation of two agents with their gates, on the seeds that both have."""
-    from ctgraph_rl.report import statistics
-
     seeds = [seed for seed in found[first] if seed in found[second]]
     values, others = ([adapted(found[key][seed]) for seed in seeds] for key in (first, second))
     return statistics.compare(values, others, bounds=SUCCESS)

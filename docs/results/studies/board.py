@@ -9,6 +9,7 @@ from ctgraph_rl.board.standings.board_formats import columns
 from ctgraph_rl.board.standings.board_page import write_board
 from ctgraph_rl.board.standings.board_tables import BoardTable
 from ctgraph_rl.board.standings.track_ceilings import Ceilings
+from ctgraph_rl.board.tracks import tracks
 from studies.raw import HERE, TEMPLATES, table
 from studies.verdicts import undecided
 
@@ -45,8 +46,6 @@ def _clearest(of: BoardTable) -> str:
 
 def _without(there: set[str]) -> str:
     """Return a sentence about the tracks that have no line; nothing where each has one."""
-    from ctgraph_rl.board.tracks import tracks
-
     lacking = [f"`{each.name}`" for each in tracks() if each.name not in there]
     return f" No line yet: {', '.join(lacking)}." if lacking else ""
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from statistics import fmean, median
 from string import Template
 
+from ctgraph_rl.metrics.curves import frames_to_mastery
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS
 from ctgraph_rl.tasks.values import open_loop_ceiling
 from studies.lifelong import comparison
@@ -360,8 +361,6 @@ def similarity() -> list[Row]:
 
 def nested_goals(method: str) -> Raw:
     """Return the times of PPO on growing depth, a line for each seed, from the table of methods."""
-    from ctgraph_rl.metrics.curves import frames_to_mastery
-
     lines = [line for line in read("methods") if (line["agent"], line["curriculum"]) == ("ppo", "fo_b1_depth2to5")]
     found = []
     for (seed,), of in groups([line for line in lines if line["method"] == method], "seed").items():

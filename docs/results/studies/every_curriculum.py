@@ -7,13 +7,14 @@ from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from ctgraph_rl.log.files import LOG
+from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.runs.read import MODIFIED
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.task import are_graphs
 from studies.raw import machine_of, write
-
-if TYPE_CHECKING:
-    from ctgraph_rl import Curriculum
-    from ctgraph_rl.log.run_log import RunLog
 
 NAME = "every_curriculum"
 
@@ -33,11 +34,6 @@ def measured(run: Path) -> dict[str, Any]:
     ``before``, ``learned`` and ``end`` are means over tasks: before training, right after each task's own block, and
     after the last block. ``curve`` has the mean over tasks at each evaluation, ``at`` the frames until then.
     """
-    from ctgraph_rl.log.files import LOG
-    from ctgraph_rl.log.run_log import RunLog
-    from ctgraph_rl.runs.read import MODIFIED
-    from ctgraph_rl.tasks.curriculum import Curriculum
-
     log = RunLog.read(run / LOG)
     about = log.of_kind("run")[0]
     metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
@@ -76,8 +72,6 @@ def mean_returns(log: RunLog) -> dict[int, float]:
 @cache
 def known_values(curriculum: Curriculum) -> dict[str, str]:
     """Return means over tasks: optimum, return of random actions, and bounds; nothing where they are not known."""
-    from ctgraph_rl.tasks.task import are_graphs
-
     tasks = curriculum.tasks
     if not are_graphs(tasks):
         return dict.fromkeys(("optimum", "random", "lowest", "highest"), "")

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from statistics import median
 from string import Template
-from typing import TYPE_CHECKING
 
+import curricula
+from ctgraph_rl.profile.properties import Measured
+from ctgraph_rl.profile.scoring import Results, Score, score_of_results
+from curricula.profile import PROPERTIES, Property
 from studies.raw import HERE, TEMPLATES, Raw, groups, machines, read, table
-
-if TYPE_CHECKING:
-    from ctgraph_rl.profile.scoring import Score
-    from curricula.profile import Property
 
 NAME = "profile"
 PAGE = HERE / "profile.md"
@@ -38,9 +37,6 @@ def raw() -> Raw:
 
 def scores(lines: Raw | None = None) -> dict[str, dict[str, Score]]:
     """Return the scores by agent and property, in the order of tables."""
-    from ctgraph_rl.profile.properties import Measured
-    from ctgraph_rl.profile.scoring import Results, score_of_results
-
     found: dict[str, dict[str, Score]] = {agent: {} for agent in AGENTS}
     by_agent = groups(raw() if lines is None else lines, "agent", "property")
     for prop in properties():
@@ -59,8 +55,6 @@ def scores(lines: Raw | None = None) -> dict[str, dict[str, Score]]:
 
 def properties() -> list[Property]:
     """Return the properties in the order of the paper."""
-    from curricula.profile import PROPERTIES
-
     return list(PROPERTIES.values())
 
 
@@ -72,8 +66,6 @@ def fresh_frames(agent: str) -> list[float]:
 
 def last_block() -> int:
     """Return the frames of the lives' last block."""
-    import curricula
-
     return curricula.load("profile_fresh").num_frames
 
 

@@ -8,11 +8,11 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from ctgraph_rl.report.intervals import Bounds
-    from ctgraph_rl.report.statistics import Estimate
+from ctgraph_rl.report import statistics
+from ctgraph_rl.report.intervals import Bounds
+from ctgraph_rl.report.statistics import Estimate
 
 HERE = Path(__file__).resolve().parents[1]
 """Where raw results, pages and pictures are."""
@@ -92,15 +92,11 @@ def mean_of(values: Sequence[float | None], bounds: tuple[float, float] | Bounds
         values: one per seed; None for a seed without.
         bounds: the lowest and the highest possible value.
     """
-    from ctgraph_rl.report import statistics
-
     return shown(statistics.mean(values, bounds=bounds))
 
 
 def share_of(solved: Sequence[bool]) -> str:
     """How many of the seeds, with the exact interval of their share."""
-    from ctgraph_rl.report import statistics
-
     return f"{sum(solved)} of {len(solved)}{interval_of(statistics.solved_rate(solved))}"
 
 

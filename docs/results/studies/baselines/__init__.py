@@ -1,4 +1,1 @@
-"""What agents get on the tasks that each learned alone, and the main job: the page baselines.md.
-
-`runs` collects raw results; `page` makes the page.
-"""
+"""What agents get on the tasks that each learned alone, and the main job: the page baselines.md."""

@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING
 
+import curricula
+from baselines.parts.catalogue import catalogue
+from ctgraph_rl import Task
+from ctgraph_rl.report.intervals import Bounds
+from ctgraph_rl.tasks.configurations import CONFIGURATIONS
+from ctgraph_rl.tasks.task import ct_graphs
+from ctgraph_rl.tasks.values import open_loop_ceiling, random_frames_to_goal
 from studies.baselines import instances, main_job, search, swap
 from studies.raw import HERE, TEMPLATES, Raw, groups, machines, mean_of, read, share_of, table
-
-if TYPE_CHECKING:
-    from ctgraph_rl import Task
-    from ctgraph_rl.report.intervals import Bounds
 
 PAGE = HERE / "baselines.md"
 OF_GOALS = (search.NAME, swap.NAME)
@@ -40,9 +42,6 @@ def cell(lines: Raw, column: str, bounds: tuple[float, float] | Bounds = (0.0, 1
 
 def by_goal(raw: Raw, configuration: str) -> str:
     """A line for each agent, a column for each goal, greedy and sampled; the ceilings of agents without memory."""
-    from baselines.parts.catalogue import catalogue
-    from ctgraph_rl.tasks.values import open_loop_ceiling
-
     kinds = {agent.name: agent.kind for agent in catalogue("agent")}
     of = groups([line for line in raw if line["configuration"] == configuration], "agent", "task")
     goals = sorted({goal for _, goal in of})
@@ -61,8 +60,6 @@ def by_goal(raw: Raw, configuration: str) -> str:
 
 def both_ways(lines: Raw, configuration: str, goal: str) -> str:
     """Mean return of the greedy and of the sampled policy, with its interval and the error of the evaluation."""
-    from ctgraph_rl.report.intervals import Bounds
-
     if not lines:
         return ""
     task, found = task_of(configuration, goal), []
@@ -84,8 +81,6 @@ def evaluation_error(lines: Raw, column: str, task: Task) -> str:
 
 def task_of(configuration: str, goal: str) -> Task:
     """The task of a configuration and a goal."""
-    from ctgraph_rl.tasks.configurations import CONFIGURATIONS
-
     name = "CT-" + configuration.upper().replace("_", "-")
     return CONFIGURATIONS[name](goal=tuple(map(int, goal.split("."))))
 
@@ -98,10 +93,6 @@ def ceilings(configuration: str, goal: str) -> list[str]:
 
 def ladder(raw: Raw) -> str:
     """A line for each agent, a column for each depth: seeds that solved it; and how often chance finds the goal."""
-    import curricula
-    from ctgraph_rl.tasks.task import ct_graphs
-    from ctgraph_rl.tasks.values import random_frames_to_goal
-
     of = groups(raw, "agent", "depth")
     depths = sorted({depth for _, depth in of}, key=int)
     chance = []

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from studies.raw import Raw
-
-if TYPE_CHECKING:
-    pass
 
 NAME = "rl2_search"
 

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from ctgraph_rl.report import statistics
+from ctgraph_rl.report.statistics import Estimate
 from studies.collectives import mosaic, selecting
 from studies.collectives.l2d2c import BLOCKS, CELL, FRAMES, KEY, NAME, new_and_known, on_l2d2c
 from studies.raw import HERE, TEMPLATES, Raw, groups, machines, mean_of, numbers_in, read, shown, table
 from studies.two_groups import two_groups
-
-if TYPE_CHECKING:
-    from ctgraph_rl.report.statistics import Estimate
 
 LONGER = "25600"
 """Frames of a block of the run alone that has twice as many."""
@@ -77,8 +76,6 @@ def _sharing(lines: Raw, number: int) -> list[str]:
 
 def _frames(times: Sequence[float], bounds: tuple[float, float]) -> str:
     """Return the mean of numbers of frames with its interval, where two seeds or more have one."""
-    from ctgraph_rl.report import statistics
-
     found = statistics.mean(times, bounds=bounds)
     if found.value is None or found.low is None or found.high is None:
         return "not measured" if found.value is None else f"{found.value:,.0f}"

@@ -1,4 +1,1 @@
-"""What methods keep and gain on sequences of tasks: the page lifelong.md.
-
-`experiments` says what was to run, and `runs` collects it; all others make the page.
-"""
+"""What methods keep and gain on sequences of tasks: the page lifelong.md."""

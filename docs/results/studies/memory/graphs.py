@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
+from ctgraph_rl.report import statistics
+from ctgraph_rl.report.statistics import Comparison
 from studies.memory.conditions import (
     GIVEN,
     NOISE,
@@ -21,9 +22,6 @@ from studies.memory.conditions import (
 from studies.memory.runs import AGENTS, count, mean, returns, solved, solved_once
 from studies.raw import Raw, interval_of, shown, table
 from studies.verdicts import ALPHA, undecided
-
-if TYPE_CHECKING:
-    from ctgraph_rl.report.statistics import Comparison
 
 RIVALS = (
     "dqn, 1 step",
@@ -68,8 +66,6 @@ def totals() -> dict[str, Raw]:
 
 def compared(of: Mapping[str, Raw]) -> dict[str, Comparison]:
     """Return the paired comparison of each agent's greedy returns with the LSTM's, p-values corrected for all."""
-    from ctgraph_rl.report import statistics
-
     base = returns(of["lstm_ppo"])
     found = {name: statistics.compare(returns(of[name]), base, bounds=(0, 1)) for name in of if name != "lstm_ppo"}
     return statistics.corrected(found)
@@ -108,7 +104,6 @@ def lower_and_undecided() -> tuple[str, str]:
     Raises:
         ValueError: for an agent with higher returns, of which the page has no word.
     """
-
     lower: list[str] = []
     others: list[str] = []
     found = compared(totals())
@@ -179,8 +174,6 @@ def better_than_poor(condition: Condition) -> str:
 
 def intervals() -> str:
     """Return the interval of the probability to solve a task for each number of seeds of five."""
-    from ctgraph_rl.report import statistics
-
     found = (statistics.solved_rate([place < number for place in range(5)]) for number in range(6))
     return ", ".join(f"{number} of 5{interval_of(each)}" for number, each in enumerate(found))
 
