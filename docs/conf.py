@@ -49,12 +49,13 @@ autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
 python_maximum_signature_line_length = 100
 napoleon_use_rtype = False
-OTHERS = "collections|fractions|gymnasium|matplotlib|numpy|os|pathlib|stable_baselines3|tensordict|torch|torchrl|types"
+OTHERS = "collections|fractions|gymnasium|matplotlib|numpy|optional|os|pandas|pathlib|stable_baselines3|tensordict|torch|torchrl|types"
 SHORT_NAMES = (
     "NDArray|Path|Sequence|Span|Tensor|TensorDictBase|nn.Module|Rule|NamedValues|ReadOnlyValues|Items|Learnt"
     "|TensorsByName"
 )
-nitpick_ignore_regex = [("py:.*", rf"({OTHERS})(\..*)?"), ("py:class", SHORT_NAMES)]
+SETTINGS = r"baselines\.\w+\.\w+Settings"  # the cards of agents list them
+nitpick_ignore_regex = [("py:.*", rf"({OTHERS})(\..*)?"), ("py:class", rf"{SHORT_NAMES}|{SETTINGS}")]
 
 
 def without_aliases(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:

@@ -51,6 +51,7 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "ctgraph_rl.learn.lifelong",
             "ctgraph_rl.learn.loop:Progress,Group",
             "ctgraph_rl.learn.labels",
+            "ctgraph_rl.learn.histories:Tree",
             "ctgraph_rl.learn.collective",
             "ctgraph_rl.learn.messages",
             "ctgraph_rl.log.tables",
@@ -63,7 +64,7 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "curricula": (
         "Curricula",
         "Published sequences by name, and functions that make others.",
-        ("curricula", "curricula.axes", "curricula.axes", "curricula.configured", "curricula.meta_json"),
+        ("curricula", "curricula.axes", "curricula.configured", "curricula.meta_json"),
     ),
     "metrics": (
         "Metrics",
@@ -126,6 +127,7 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "baselines.parts.inner_loop:InnerModel,Episodes,Played",
             "baselines.parts.gates:GatedNetwork",
             "baselines.update.update:UpdateState,update,Parts,make_optimiser,has_parts,parts_of,minimise,step",
+            "baselines.update.trained:Trained",
             "baselines.parts.embedding",
             "baselines.parts.transport",
             "baselines.methods.method",
