@@ -49,7 +49,10 @@ autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
 python_maximum_signature_line_length = 100
 napoleon_use_rtype = False
-OTHERS = "collections|fractions|gymnasium|matplotlib|numpy|optional|os|pandas|pathlib|stable_baselines3|tensordict|torch|torchrl|types"
+OTHERS = (
+    "collections|fractions|gymnasium|matplotlib|numpy|optional|os|pandas|pathlib|stable_baselines3|tensordict|torch"
+    "|torchrl|types"
+)
 SHORT_NAMES = (
     "NDArray|Path|Sequence|Span|Tensor|TensorDictBase|nn.Module|Rule|NamedValues|ReadOnlyValues|Items|Learnt"
     "|TensorsByName"
