@@ -13,11 +13,11 @@ A row draws z before each episode of a trial. The losses are those of soft actor
     loss_policy = sum_b pi(b | o, z) (alpha log pi(b | o, z) - min_j Q_j(o, b, z))
     loss_context = kl_coeff KL(q(z | c) || N(0, 1))
 
-They are means over steps. The encoder, which computes mu_i and s_i, gets no gradient of loss_policy. Q' follows Q.
+They are means over steps. The encoder of mu_i and s_i gets no gradient of loss_policy. Q' follows Q.
 
-A task is a trial: nothing tells that two trials have one goal. Replay holds the last steps of all rows. A context, and
-the steps that the other losses read, are drawn from one trial there. As a context is a set of single steps, it says
-where the goal is if the observation that comes with the reward is not that of other end states, too.
+Each trial counts as a task. Replay holds the last steps of all rows; a context and the steps of the other losses come
+from one trial. As a context is a set of steps, it shows the goal only if the rewarded observation differs from other
+end states'.
 """
 
 from __future__ import annotations
@@ -60,27 +60,27 @@ SMALLEST_VARIANCE = 1e-7
 ACTION = f"{UNSTORED}action"
 PRECISION = f"{UNSTORED}precision"
 WEIGHTED = f"{UNSTORED}weighted"
-"""A row's last action, and the sums of 1/s_i and mu_i/s_i over the steps of its trial."""
+"""A row's last action, and the sums of 1/s_i and mu_i/s_i over its trial."""
 
 CONTEXT = f"{UNSTORED}context"
 """The z of a row's episode."""
 
 
 def gaussian(precision: Tensor, weighted: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute mu and s, [..., num_context] each, from the sums of 1/s_i and mu_i/s_i."""
+    """Return mu and s, [..., num_context] each, from the sums of 1/s_i and mu_i/s_i."""
     variance = torch.where(precision > 0, 1 / precision, 1.0)
     return variance * weighted, variance
 
 
 def kl_to_prior(mean: Tensor, variance: Tensor) -> Tensor:
-    """Compute the divergence of a Gaussian from N(0, 1), [...], from [..., num_context]."""
+    """Return the divergence of a Gaussian, [..., num_context], from N(0, 1), [...]."""
     return 0.5 * (variance + mean.square() - 1 - variance.log()).sum(dim=-1)
 
 
 class PosteriorPolicy(TensorDictModuleBase):
-    """Draws a row's z before each episode, from the posterior of the steps of its trial.
+    """Draws a row's z before each episode, from the posterior of its trial's steps.
 
-    The sums over a trial have what each step added with the weights that the encoder had at the time.
+    Each step counts by the encoder's weights at its time.
 
     Args:
         actor: maps what is seen and z to logits.
@@ -105,7 +105,7 @@ class PosteriorPolicy(TensorDictModuleBase):
         self.out_keys = ["action", *(("next", key) for key in state)]
 
     def evidence(self, seen: NetInputs, action: Tensor, reward: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute 1/s_i and mu_i/s_i of steps, [..., num_context] each."""
+        """Return 1/s_i and mu_i/s_i of steps, [..., num_context] each."""
         found = self.encoder(*seen, one_hot(action, self.num_actions), reward)
         mean, raw = found.chunk(2, dim=-1)
         precision = 1 / softplus(raw).clamp(min=SMALLEST_VARIANCE)
@@ -176,11 +176,11 @@ class PEARLSettings:
 class PEARL(Learner):
     """Discrete soft actor-critic with a posterior over tasks.
 
-    The losses are those of TorchRL's `DiscreteSACLoss`, but plain: it takes one context for both of its losses, where
-    the policy's must not reach the encoder, and it keeps its critics where a `Learner` does not find their weights.
+    TorchRL's `DiscreteSACLoss` has one context for both losses, where the policy's must not reach the encoder, and
+    hides its critics from a `Learner`.
 
     Args:
-        settings: the fields of `PEARLSettings`.
+        settings: of `PEARLSettings`.
     """
 
     Settings = PEARLSettings
@@ -222,7 +222,7 @@ class PEARL(Learner):
         """The last steps of all rows, [rows, steps] each, and whether a trial ``begins`` there."""
 
     def initial_state(self, num_envs: int) -> TensorDict:
-        """Return the state before the first trial; it lasts over episodes, as it has a key ``trial``."""
+        """Return the state before the first trial, which lasts over episodes by its key ``trial``."""
         like = next(self.parameters()).detach()
         counts = like.new_zeros(num_envs, dtype=torch.int64)
         state = {"trial": counts.unsqueeze(-1), ACTION: counts, "reward": like.new_zeros(num_envs, 1)}
@@ -253,7 +253,7 @@ class PEARL(Learner):
             yield {**self._steps(*trial, self.settings.batch_size), **context, "noise": noise}
 
     def _store(self, batch: TensorDictBase) -> None:
-        """Append a batch to the steps of each row, and drop the oldest ones."""
+        """Append a batch to each row's steps, and drop the oldest."""
         begins = batch["is_init"] & (batch["next", "trial"] == 1)
         keys = [*self.specs, "action", ("next", "reward"), ("next", "terminated")]
         keys += [("next", key) for key in self.specs]
@@ -275,7 +275,7 @@ class PEARL(Learner):
         return {f"critics.{name}": value for name, value in self.targets.named_parameters()}
 
     def loss(self, batch: Data, others: Data | None = None) -> TensorsByName:
-        """Compute the losses of what `minibatches` yields."""
+        """Return the losses of a minibatch."""
         mean, variance = self.posterior(batch)
         context = (mean + variance.sqrt() * batch["noise"]).unsqueeze(1).expand(-1, batch["action"].shape[1], -1)
         fixed = context.detach()
@@ -299,12 +299,12 @@ class PEARL(Learner):
         }
 
     def smaller(self, seen: NetInputs, context: Tensor) -> Tensor:
-        """Compute the smaller of the critics' action values, [..., num_actions]."""
+        """Return the smaller of the critics' action values, [..., num_actions]."""
         first, second = (critic(*seen, context) for critic in self.critics)
         return torch.minimum(first, second)
 
     def posterior(self, batch: Data) -> tuple[Tensor, Tensor]:
-        """Compute mu and s of the contexts of a minibatch, [num_trials, num_context] each."""
+        """Return mu and s of a minibatch's contexts, [num_trials, num_context] each."""
         seen = tuple(batch["context", key] for key in self.specs)
         given = batch["context", "action"], batch["context", ("next", "reward")]
         precision, weighted = self.policy.evidence(seen, *given)

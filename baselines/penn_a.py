@@ -1,8 +1,8 @@
 """PENN-A: a population of plastic neuromodulated networks evolves, and each learns within its life, without gradients.
 
 Ben-Iwhiwhu et al. 2020, "Evolving inborn knowledge for fast adaptation in dynamic POMDP problems" (GECCO, arXiv
-2004.12846). An individual lives several trials, a row of the environment each, and its fitness is the mean sum of their
-rewards over ``life_episodes`` episodes. It gets no reward: it must see in the image of an end state what was paid.
+2004.12846). An individual lives several trials, a row each, and its fitness is the mean sum of their rewards over
+``life_episodes`` episodes. It gets no reward, but sees the image of an end state.
 
 Observations become 16 latents of an autoencoder, scaled by the largest one, logit(l / max l) clipped to [0, 1]. They
 and a constant 1 are the inputs of neurons, of which the first one acts: an output above 1/3 is action 2, one below -1/3
@@ -15,14 +15,13 @@ Weights from modulatory neurons stay. A gene g gives w = 10 g^3; a weight below 
 g^3 or 0 below 0.01, and r = 100 g^3. A life begins with these weights.
 
 After a generation the population is cut into segments at a random place. The best of a segment has all its children:
-clones or crossed with a random individual. Then a neuron can be inserted, then one duplicated, then one deleted: three
-independent draws. Then all genes are mutated by +-exp(-180 |u|), u uniform in [-1, 1]. A new neuron is standard or
-modulatory with equal probability, and its genes are 0 before that. Individuals before the first segment have a child
-each. The best one of all stays unchanged and is individual 0. The first generation's genes of weights are mutated
-zeros, with 10 in place of 180, those of the rule uniform. The autoencoder learns from what the population saw.
+clones or crossed with a random individual. Then, by independent draws, a neuron is inserted, one duplicated, one
+deleted, and all genes are mutated by +-exp(-180 |u|), u uniform in [-1, 1]. A new neuron is standard or modulatory with
+equal probability, with genes of 0 before. Individuals before the first segment have a child each. The best of all stays
+unchanged as individual 0. The first generation's weights are mutated zeros, with 10 in place of 180, its rule's genes
+uniform. The autoencoder learns from what the population saw.
 
-A greedy evaluation plays the best individual, which is the result of evolution; the mean of the population has mutants
-that are of no use, and training measures it. An evaluation that samples plays the population in turns.
+A greedy evaluation plays the best individual, one that samples the population in turns.
 """
 
 from __future__ import annotations
@@ -54,17 +53,17 @@ THRESHOLD = 0.33
 LARGEST_WEIGHT = 10.0
 
 NEURONS = (False, False, False, False, True, True, True)
-"""Which neurons of the first individuals are modulatory; the first neuron acts."""
+"""Which of the first individuals' neurons are modulatory; the first neuron acts."""
 
 FIRST_PRECISION = 10.0
-"""Of the mutation that gives the first individuals their genes."""
+"""Of the mutation that makes the first individuals."""
 
 WEIGHTS = f"{UNSTORED}weights"
 OUTPUTS = f"{UNSTORED}outputs"
 
 
 class Population(NamedTuple):
-    """Genomes, padded to the most neurons that an individual has."""
+    """Genomes, padded to the most neurons of an individual."""
 
     genes: Tensor  # of weights, [individuals, inputs + neurons, neurons]; 0 where there is no neuron
     rule: Tensor  # genes of A, B, C, D and r, [individuals, 5]
@@ -81,14 +80,14 @@ class Population(NamedTuple):
         return self.genes.shape[1] - self.genes.shape[2]
 
     def within(self, size: Tensor) -> Tensor:
-        """Return which genes are of the first ``size`` neurons of each individual, bool like ``genes``."""
+        """Return which genes belong to the first ``size`` neurons of each individual, bool like ``genes``."""
         row = torch.arange(self.genes.shape[1], device=size.device).view(-1, 1)
         column = torch.arange(self.genes.shape[2], device=size.device)
         limit = size.view(-1, 1, 1)
         return (row < self.num_inputs + limit) & (column < limit)
 
     def weights(self) -> Tensor:
-        """Return the weights that individuals are born with, like ``genes``."""
+        """Return the weights at birth, like ``genes``."""
         weights = LARGEST_WEIGHT * self.genes**3
         return torch.where(weights.abs() < 0.1, 0.0, weights)
 
@@ -100,7 +99,7 @@ class Population(NamedTuple):
 
 
 def live(lives: Population, inputs: Tensor, weights: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
-    """Return weights and outputs after a step; tensors have their rows last meanwhile, as a sum is fastest then.
+    """Return weights and outputs after a step, computed with rows last, which is fastest.
 
     Args:
         lives: the individual of each row.
@@ -139,7 +138,7 @@ class Reproduction:
     precision: float  # of mutations, see `mutation`
 
     def children(self, parents: Population, fitness: Tensor) -> Population:
-        """Return the next generation; its first individual is the best of this one, unchanged."""
+        """Return the next generation, whose first individual is this one's best."""
         offset = torch.randint(self.segment_size, (), dtype=torch.int64, device="cpu")
         chosen = winners(fitness, self.segment_size, int(offset))
         chosen[0] = fitness.argmax()
@@ -148,7 +147,7 @@ class Reproduction:
         return mutated(self.resized(crossed), self.precision)
 
     def crossed(self, parents: Population, mates: Population) -> Population:
-        """Give some children the rows of a mate's genes from a random one on, as far as both have neurons."""
+        """Give some children a mate's genes from a random row on, as far as both have neurons."""
         crosses = chances(parents).view(-1, 1) < self.crossover_prob
         shared = torch.minimum(parents.size, mates.size)
         point = 1 + (chances(parents) * (parents.num_inputs + shared - 1)).floor().view(-1, 1)
@@ -161,7 +160,7 @@ class Reproduction:
         )
 
     def resized(self, population: Population) -> Population:
-        """Insert, then duplicate, then delete a neuron, each of some individuals; the first neuron stays."""
+        """Insert, duplicate and delete a neuron of some individuals; the first neuron stays."""
         blank = torch.full_like(population.size, population.modulates.shape[1])
         population = grown(population, chances(population) < self.insert_prob, blank)
         population = grown(population, chances(population) < self.duplicate_prob, below(population.size))
@@ -170,14 +169,14 @@ class Reproduction:
 
 
 def chances(population: Population) -> Tensor:
-    """Draw a number of [0, 1) for each individual, but 1 for the first, to which so nothing happens; [individuals]."""
+    """Draw from [0, 1) for each individual, but 1 for the first, which stays as it was; [individuals]."""
     drawn = torch.rand_like(population.rule[:, 0])
     drawn[0] = 1
     return drawn
 
 
 def below(count: Tensor) -> Tensor:
-    """Draw an integer of each range from 0 on, int64 like ``count``."""
+    """Draw an integer in [0, count), int64."""
     drawn = torch.rand(count.shape, dtype=torch.float32, device=count.device)
     return (drawn * count).long().minimum(count - 1)
 
@@ -188,7 +187,7 @@ def grown(population: Population, who: Tensor, model: Tensor) -> Population:
     Args:
         population: of up to n neurons.
         who: which individuals, bool [individuals].
-        model: the neuron that is copied, but for the gene to itself; n: a new one, int64 [individuals].
+        model: the neuron to copy, but for the gene to itself; n: a new one, int64 [individuals].
     """
     place = torch.arange(population.modulates.shape[1] + 1, device=who.device)
     added = who.unsqueeze(-1) & (place == population.size.unsqueeze(-1))
@@ -198,7 +197,7 @@ def grown(population: Population, who: Tensor, model: Tensor) -> Population:
 
 
 def shrunk(population: Population, who: Tensor, lost: Tensor) -> Population:
-    """Delete a neuron, int64 [individuals], of some individuals, bool [individuals]; later ones move up."""
+    """Delete neurons, int64 [individuals], of some individuals, bool [individuals]; later ones move up."""
     size = population.size - who.long()
     place = torch.arange(int(size.max()), device=who.device)
     moves = who.unsqueeze(-1) & (place >= lost.unsqueeze(-1))
@@ -206,11 +205,11 @@ def shrunk(population: Population, who: Tensor, lost: Tensor) -> Population:
 
 
 def rearranged(population: Population, source: Tensor, size: Tensor) -> Population:
-    """Return individuals whose neurons are copies of others, or new ones.
+    """Return individuals whose neurons are copies of others, or new.
 
     Args:
         population: of up to n neurons.
-        source: the neuron that each is a copy of, n for a new one, int64 [individuals, neurons].
+        source: the neuron that each copies, n for a new one, int64 [individuals, neurons].
         size: neurons of each individual.
     """
     inputs = population.num_inputs
@@ -230,7 +229,7 @@ def draw_like(values: Tensor) -> Tensor:
 
 
 def mutation(genes: Tensor, precision: float) -> Tensor:
-    """Draw changes of genes: of either sign, P(|change| > x) = -ln(x) / precision for x above exp(-precision)."""
+    """Draw changes of genes of either sign: P(|change| > x) = -ln(x) / precision for x above exp(-precision)."""
     drawn = draw_like(genes)
     return drawn.sign() * (-precision * drawn.abs()).exp()
 
@@ -245,7 +244,7 @@ def mutated(population: Population, precision: float) -> Population:
 
 
 def winners(fitness: Tensor, segment_size: int, offset: int) -> Tensor:
-    """Return the parent of each child, int64 [individuals]: itself before the offset, then the best of its segment."""
+    """Return each child's parent, int64 [individuals]: itself before the offset, then its segment's best."""
     count = len(fitness)
     padding = (0, (offset - count) % segment_size)
     segments = pad(fitness[offset:], padding, value=-torch.inf).view(-1, segment_size)
@@ -275,7 +274,7 @@ class Autoencoder(nn.Module):
 
     Args:
         num_pixels: numbers of an observation.
-        scale: observations are divided by it.
+        scale: divisor of observations.
         hidden_size: units between observation and latents.
         num_latents: latents.
     """
@@ -292,7 +291,7 @@ class Autoencoder(nn.Module):
         return mse_loss(self.decoder(self.encoder(flat)), flat)
 
     def inputs(self, observation: Tensor) -> Tensor:
-        """Compute the inputs of neurons, [n, num_latents + 1]; equal observations are encoded once."""
+        """Return inputs of neurons, [n, num_latents + 1]; equal observations are encoded once."""
         examples, groups = distinct([observation])
         latents = self.encoder(observation[examples].flatten(1) / self.scale)
         share = latents / (latents.amax(dim=1, keepdim=True) + 1e-5)
@@ -330,10 +329,10 @@ class PennASettings(Reproduction):
 
 
 class PennA(TensorDictModuleBase):
-    """A population that evolves. It is its own policy: each row has weights that last over the episodes of a life.
+    """A population that evolves and is its policy: each row has weights that last over a life's episodes.
 
     Args:
-        settings: the fields of `PennASettings`.
+        settings: of `PennASettings`.
     """
 
     Settings = PennASettings
@@ -368,7 +367,7 @@ class PennA(TensorDictModuleBase):
         return self
 
     def policy_for(self, task: int) -> TensorDictModuleBase:
-        """Return the policy, which is the same for all tasks."""
+        """Return the policy, the same for all tasks."""
         return self
 
     def start_task(self, task: int | None = None) -> None:
@@ -378,7 +377,7 @@ class PennA(TensorDictModuleBase):
         """Do nothing."""
 
     def initial_state(self, num_envs: int) -> TensorDict:
-        """Return the state before a life; it lasts over episodes, as it has a key ``trial``."""
+        """Return the state before a life, which lasts over episodes by its key ``trial``."""
         genes = self.population.genes
         none = genes.new_zeros(num_envs, 1, dtype=torch.int64)
         weights = genes.new_zeros(num_envs, *genes.shape[1:])
@@ -386,7 +385,7 @@ class PennA(TensorDictModuleBase):
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action`` and the next state; ``trial`` is the number of the episode in its life, from 1."""
+        """Write ``action`` and the next state; ``trial`` is the episode's number in its life, from 1."""
         rows = torch.arange(len(tensordict), device=tensordict["trial"].device)
         who = torch.zeros_like(rows) if is_greedy() else rows // self.settings.num_trials % len(self.population.size)
         lives = self.population.take(who)
@@ -411,11 +410,11 @@ class PennA(TensorDictModuleBase):
         return tensordict.update({("next", key): value for key, value in after.items()})
 
     def loss(self, batch: Data) -> TensorsByName:
-        """Compute the autoencoder's loss; the population has none."""
+        """Return the autoencoder's loss."""
         return {"loss_autoencoder": self.autoencoder.loss(batch["observation"])}
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """Add up rewards; after the last batch of a life, let the population reproduce and the autoencoder learn."""
+        """Add up rewards; after a life's last batch, the population reproduces and the autoencoder learns."""
         after = batch["next"]
         is_born = (after["life"] == self.generation) & (after["trial"] > 0)
         self.rewards += (after["reward"] * (is_born & (after["trial"] <= self.settings.life_episodes))).sum(dim=(1, 2))
@@ -436,7 +435,7 @@ class PennA(TensorDictModuleBase):
         return measured
 
     def _learn_latents(self, seen: Tensor) -> float:
-        """Let the autoencoder learn from some of what was seen; return its mean loss.
+        """Train the autoencoder on some of what was seen; return its mean loss.
 
         Raises:
             FloatingPointError: if that is not finite.
@@ -456,7 +455,7 @@ class PennA(TensorDictModuleBase):
         return super()._apply(fn, recurse)
 
     def get_extra_state(self) -> NamedValues:
-        """Return what `state_dict` has beside tensors of one shape: the population, its age, the optimiser's state."""
+        """Return the population, its age and the optimiser's state."""
         state = {"population": self.population._asdict(), "generation": self.generation, "lived": self.lived}
         state["optimiser"] = self.optimiser.state_dict()
         return state

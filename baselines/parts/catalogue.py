@@ -1,4 +1,4 @@
-"""The agents, cells and methods of this package, as the yaml files in ``conf`` name them."""
+"""The agents, cells and methods that the yaml files in ``conf`` name."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ class CatalogueEntry(NamedTuple):
 
     @property
     def kind(self) -> Any:
-        """The class; to import it loads torch, which takes seconds."""
+        """The class; its import loads torch, which takes seconds."""
         module, _, name = self.target.rpartition(".")
         return class_named(module, name)
 
     @property
     def facts(self) -> NamedValues:
-        """The constants among the attributes of the class, read from its source without importing it; none of yours."""
+        """The class's constants, read from its source without an import; empty for yours."""
         return constants(self.target) if self.target.startswith("baselines.") else {}
 
     def says(self, fact: str) -> str:
-        """Return ``yes`` or ``no`` of a fact of a class of this package, and ``-`` of yours."""
+        """Return ``yes`` or ``no`` of a fact of our class, ``-`` of yours."""
         return "-" if fact not in self.facts else "yes" if self.facts[fact] else "no"
 
 
 def config_dir_of(command: str, description: str | None) -> Path | None:
-    """Return the ``--config-dir`` of a command that lists, which has no other argument."""
+    """Return the ``--config-dir`` of a listing command."""
     parser = ArgumentParser(prog=f"ctgraph-rl {command}", description=description)
     parser.add_argument("--config-dir", type=Path, metavar="DIR", help="also lists those of this directory")
     folder: Path | None = parser.parse_args().config_dir
@@ -51,7 +51,7 @@ def config_dir_of(command: str, description: str | None) -> Path | None:
 
 
 def catalogue(group: str, config_dir: Path | None = None) -> Iterator[CatalogueEntry]:
-    """Yield an entry for each yaml file in ``conf/GROUP``, except those that only change values of another one.
+    """Yield an entry for each yaml file in ``conf/GROUP`` that does not only change values of another one.
 
     Args:
         group: such as ``agent``.
@@ -71,7 +71,7 @@ def catalogue(group: str, config_dir: Path | None = None) -> Iterator[CatalogueE
 
 
 def constants(target: str) -> NamedValues:
-    """Return what the body of a class of `baselines`, or of one of its bases there, sets to constants."""
+    """Return the constants of a class of `baselines` and its bases there."""
     module, _, name = target.rpartition(".")
     path = ROOT.joinpath(*module.split(".")).with_suffix(".py")
     homes: dict[str, str] = {}

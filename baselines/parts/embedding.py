@@ -1,8 +1,8 @@
 """Embeddings of tasks: a sample of transitions as one vector.
 
-Linear Wasserstein embedding (Kolouri et al. 2021, arXiv 2006.09430), on transitions in place of labelled data
-(Liu et al. 2022, arXiv 2208.11726); sliced Wasserstein embedding, with sorted projections in place of the plan. N are
-samples, n coordinates of each, M reference points, L directions.
+Linear Wasserstein embedding (Kolouri et al. 2021, arXiv 2006.09430), on transitions in place of labelled data (Liu et
+al. 2022, arXiv 2208.11726); sliced Wasserstein embedding, with sorted projections in place of the plan. N samples have
+n coordinates; M are reference points, L directions.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from torch.nn.functional import normalize, one_hot
 from baselines.parts.transport import optimal_plan
 
 REFERENCE_SEED = 98
-"""Of reference points and directions: embeddings are comparable if they share these."""
+"""Embeddings are comparable if they share reference points and directions."""
 
 
 def transitions(observation: Tensor, action: Tensor, reward: Tensor, num_actions: int) -> Tensor:
     """Return transitions as points: standardised observation, one-hot action, reward.
 
-    One mean and one standard deviation over all pixels of the sample standardise the observations.
+    Observations are standardised by one mean and deviation over all pixels of the sample.
 
     Args:
         observation: [N, ...], of any number type.
@@ -45,7 +45,7 @@ def transitions(observation: Tensor, action: Tensor, reward: Tensor, num_actions
 
 
 def with_last(recent: Mapping[str, Tensor], batch: TensorDictBase, most: int) -> dict[str, Tensor]:
-    """Return the last transitions of ``recent`` and of a batch behind them, row after row, [n, ...] each."""
+    """Return the last transitions of ``recent`` and then a batch, row after row, [n, ...] each."""
     given = {"observation": batch["observation"], "action": batch["action"], "reward": batch["next", "reward"]}
     found = {}
     for key, values in given.items():
@@ -55,7 +55,7 @@ def with_last(recent: Mapping[str, Tensor], batch: TensorDictBase, most: int) ->
 
 
 def sampled_points(recent: Mapping[str, Tensor], number: int, num_actions: int, generator: torch.Generator) -> Tensor:
-    """Draw some of what `with_last` returned, without replacement, as points; see `transitions`."""
+    """Draw some results of `with_last` without replacement, as points of `transitions`."""
     order = torch.randperm(len(recent["action"]), generator=generator, device="cpu")
     drawn = order[:number]
     reward = recent["reward"][drawn].squeeze(-1)
@@ -63,31 +63,28 @@ def sampled_points(recent: Mapping[str, Tensor], number: int, num_actions: int, 
 
 
 def reference_points(number: int, width: int, seed: int = REFERENCE_SEED) -> Tensor:
-    """Return points drawn uniformly from [0, 1)^n, float32 [M, n]; the same for equal arguments."""
+    """Return uniform points from [0, 1)^n, float32 [M, n], fixed by the arguments."""
     generator = torch.Generator(device="cpu").manual_seed(seed)
     return torch.rand(number, width, generator=generator, dtype=torch.float32, device="cpu")
 
 
 def unit_directions(number: int, width: int, seed: int = REFERENCE_SEED) -> Tensor:
-    """Return directions drawn uniformly from the unit sphere, float32 [L, n]; the same for equal arguments."""
+    """Return uniform directions from the unit sphere, float32 [L, n], fixed by the arguments."""
     generator = torch.Generator(device="cpu").manual_seed(seed)
     directions = torch.randn(number, width, generator=generator, dtype=torch.float32, device="cpu")
     return normalize(directions, dim=1)
 
 
 def linear_wasserstein(points: Tensor, reference: Tensor) -> Tensor:
-    """Return the linear Wasserstein embedding of points.
+    """Return the linear Wasserstein embedding of points, float32 [M * n].
 
-    f_i = (M sum_j gamma_ji x_j - R_i) / sqrt(M), with the optimal plan gamma for squared Euclidean distances between
-    N points x and M reference points R of equal masses. Where the plan splits no R_i, its norm is the 2-Wasserstein
-    distance. Equal points are merged first: the embedding stays the same, and the plan takes a fraction of the time.
+    f_i = (M sum_j gamma_ji x_j - R_i) / sqrt(M), with the optimal plan gamma for squared Euclidean distances between N
+    points x and M reference points R of equal masses. Where the plan splits no R_i, its norm is the 2-Wasserstein
+    distance. Equal points are merged first, which is faster and changes nothing.
 
     Args:
         points: float32 [N, n].
         reference: float32 [M, n].
-
-    Returns:
-        float32 [M * n].
     """
     x, counts = points.cpu().double().unique(dim=0, return_counts=True)
     r = reference.cpu().double()
@@ -101,18 +98,15 @@ def linear_wasserstein(points: Tensor, reference: Tensor) -> Tensor:
 
 
 def sliced_wasserstein(points: Tensor, directions: Tensor, num_quantiles: int) -> Tensor:
-    """Return the sliced Wasserstein embedding of points, of norm 1.
+    """Return the sliced Wasserstein embedding of points, of norm 1, float32 [L * num_quantiles].
 
-    Along each direction these are the quantiles of the projections at equally spaced levels from 0 to 1, with linear
-    interpolation, divided by sqrt(L * num_quantiles), and then all by their norm.
+    It holds quantiles of the projections on each direction, at equally spaced levels from 0 to 1 with linear
+    interpolation, divided by sqrt(L * num_quantiles) and then by their norm. It is zero where all points are 0.
 
     Args:
         points: float32 [N, n].
         directions: float32 [L, n], of norm 1.
         num_quantiles: at least 2.
-
-    Returns:
-        float32 [L * num_quantiles]; zeros where all points are 0.
     """
     levels = torch.linspace(0, 1, num_quantiles, dtype=points.dtype, device=points.device)
     quantiles = (points @ directions.T).quantile(levels, dim=0)
@@ -120,27 +114,24 @@ def sliced_wasserstein(points: Tensor, directions: Tensor, num_quantiles: int) -
 
 
 def sliced_distances(samples: Tensor, other: Tensor, directions: Tensor) -> Tensor:
-    """Compute sliced 2-Wasserstein distances of several samples from one, all of N points.
+    """Return sliced 2-Wasserstein distances of several samples from one, float [...].
 
-    Its square is the mean over the directions of the squared 2-Wasserstein distance of the projections, which is the
-    mean squared difference of the sorted projections. A sample that is moved by c has the distance sqrt(mean((D c)^2)).
+    Its square is the mean over directions of the mean squared difference of the sorted projections. A sample that is
+    moved by c has the distance sqrt(mean((D c)^2)).
 
     Args:
         samples: float [..., N, n].
         other: float [N, n].
         directions: D, float [L, n], of norm 1.
-
-    Returns:
-        float [...].
     """
     differences = _sorted_projections(samples, directions) - _sorted_projections(other, directions)
     return differences.square().mean(dim=(-2, -1)).sqrt()
 
 
 def _sorted_projections(samples: Tensor, directions: Tensor) -> Tensor:
-    """Return the projections of points [..., N, n] on directions [L, n] in rising order, [..., L, N].
+    """Return projections of points [..., N, n] on directions [L, n] in rising order, [..., L, N].
 
-    NumPy sorts them, which takes a twentieth of PyTorch's time.
+    NumPy sorts in a twentieth of PyTorch's time.
     """
     projections = directions @ samples.mT
     in_order = np.sort(projections.cpu().numpy())

@@ -1,8 +1,8 @@
 """A network whose layers may be modulated by gates (Ben-Iwhiwhu et al. 2022, Neural Networks, arXiv 2111.00134).
 
 A layer is y = relu((W x + b) g) with the gate g = tanh(s), s = W_o relu(W_n x + b_n) + b_o; ``hard`` takes the sign of
-s, 1 at 0, and ``none`` no gate. The gradient of a sign is 0, so a hard gate never learns: it is fixed and random, as in
-the code that was released with the paper. ``hard_straight_through`` has the values of ``hard`` and the gradient of s.
+s, 1 at 0, and ``none`` no gate. A hard gate has no gradient: it stays random, as in the paper's code.
+``hard_straight_through`` has the values of ``hard`` and the gradient of s.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class GatedLayer(nn.Module):
         return outputs.relu() if self.gate == "none" else (outputs * self.gates(inputs)).relu()
 
     def gates(self, inputs: Tensor) -> Tensor:
-        """Compute g, [..., num_outputs]."""
+        """Return g, [..., num_outputs]."""
         drive = self.modulator(inputs)
         if self.gate == "soft":
             return drive.tanh()
@@ -55,17 +55,17 @@ class GatedLayer(nn.Module):
 
 
 class GatedNetwork(nn.Module):
-    """Layers from observations to logits; their weights are as Glorot & Bengio 2010 draw them, biases 0.
+    """Layers from observations to logits; weights as in Glorot & Bengio 2010, biases 0.
 
     Args:
-        shape: shape of one observation.
+        shape: of one observation.
         high: largest value of an observation.
         num_extra: width of further inputs.
         hidden_size: width of each layer.
         num_layers: layers before the output, which has no gate.
         num_outputs: logits.
         gate: one of `GATES`.
-        gate_size: see `GatedLayer`.
+        gate_size: as in `GatedLayer`.
     """
 
     def __init__(
@@ -107,13 +107,13 @@ class GatedNetwork(nn.Module):
 
 
 def shown_specs(observation_spec: Composite) -> dict[str, TensorSpec]:
-    """Return the specs of what a network sees: the observation and, where the environment has it, the task id."""
+    """Return the specs of what a network sees: the observation and, if there is one, the task id."""
     shown = [key for key in ("observation", "task_id") if key in observation_spec.keys()]  # noqa: SIM118, no dict
     return {key: observation_spec[key] for key in shown}
 
 
 def gated_network(specs: dict[str, TensorSpec], num_extra: int, num_outputs: int, **sizes: Any) -> GatedNetwork:
-    """Build a network that reads what `shown_specs` returned, and further inputs.
+    """Build a network that reads the keys of `shown_specs` and further inputs.
 
     Args:
         specs: of what it sees.
@@ -129,7 +129,7 @@ def gated_network(specs: dict[str, TensorSpec], num_extra: int, num_outputs: int
 def require_gated_weights(
     observation_spec: Composite, hidden_size: int, num_layers: int, *, num_context: int, gate_size: int
 ) -> None:
-    """Refuse networks whose weights, gradients and moments of Adam the machine cannot hold.
+    """Refuse networks whose weights, gradients and moments of Adam exceed the memory.
 
     Raises:
         ValueError: names the layers and the bytes.

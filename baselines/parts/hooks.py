@@ -13,39 +13,41 @@ from baselines.parts.networks import Data, TensorsByName
 class Hooks(nn.Module):
     """Hooks that change nothing; an agent calls them in each gradient step, in this order.
 
-    Those after the first get the agent's weights, by which its losses are differentiated, one tensor of each layer's.
-    `baselines.methods.method.Method` derives from it. Buffers and parameters are saved with the agent.
+    Those after the first get the weights by which the agent's losses are differentiated, a tensor of each layer's.
+    Buffers and parameters are saved with the agent.
     """
 
     stackable: ClassVar[bool] = True
-    """Whether several seeds can share a gradient step, see `baselines.update.seeds`. A subclass that overrides a
-    hook must set it again."""
+    """Whether several seeds can share a gradient step (`baselines.update.seeds`). A subclass that overrides a hook must
+    set it again.
+    """
 
     of_one_seed: ClassVar[bool] = False
-    """Whether `transform_gradients` and `after_step` take one seed's tensors, and are vectorised for several; else they
-    take those of several, too, with the seeds as a leading dimension."""
+    """Whether `transform_gradients` and `after_step` take one seed's tensors and are vectorised; else they also take
+    several seeds', as a leading dimension.
+    """
 
     acts_on_batches: ClassVar[bool] = False
-    """Whether `on_batch` draws random numbers or changes weights, which seeds on a GPU cannot follow."""
+    """Whether `on_batch` draws or changes weights, which seeds on a GPU cannot follow."""
 
     step_buffers: ClassVar[tuple[str, ...]] = ()
-    """Names of the buffers that the hooks of a step write, in place."""
+    """Buffers that the hooks of a step write in place."""
 
     def network_weights(self, trained: list[nn.Parameter]) -> list[nn.Parameter]:
-        """Return the parameters by which the agent's losses are differentiated, given what its optimiser trains."""
+        """Return the parameters by which losses are differentiated, given what the optimiser trains."""
         return trained
 
     def transform_minibatch(self, batch: Data) -> Data:
-        """Return the minibatch to learn from in place of the given one."""
+        """Return the minibatch to learn from."""
         return batch
 
     def penalties(self, batch: Data, weights: Sequence[Tensor]) -> TensorsByName:
-        """Return what is added to the agent's losses, as scalars named ``loss_*``."""
+        """Return scalars to add to the agent's losses, named ``loss_*``."""
         return {}
 
     def transform_gradients(self, gradients: Sequence[Tensor], weights: Sequence[Tensor]) -> Sequence[Tensor]:
-        """Return the gradients of the optimiser's parameters, given those of the agent's weights."""
+        """Return the gradients of the optimiser's parameters, given those of the weights."""
         return gradients
 
     def after_step(self, weights: Sequence[Tensor]) -> None:
-        """Called after each step of the optimiser; it may write the weights."""
+        """Called after each step of the optimiser; may write the weights."""

@@ -1,27 +1,27 @@
 """The base class of agents that adapt to a task by a gradient step within a trial: MAML and CAVIA.
 
-A trial is a number of episodes of one task in one row. A row plays ``adapt_episodes`` with the weights that all trials
-begin with, adapts, and plays as many with the adapted ones. The inner loss is that of REINFORCE,
+A trial is a number of episodes of one task in one row. A row plays ``adapt_episodes`` with the initial weights, adapts,
+and plays as many with the adapted ones. The inner loss is that of REINFORCE,
 
     L = - 1/E sum_e 1/T_e sum_t A_t log pi(a_t | o_t),
 
 over the E episodes of T_e steps before the adaptation. The outer loss is the same over the episodes after it, with the
-ratio of probabilities in place of log pi, and is differentiated through the inner gradient. TRPO (Schulman et al.
-2015, arXiv 1502.05477) minimises it as published, or PPO by clipped steps of Adam. A = R - b, with mean 0 and standard
+ratio of probabilities in place of log pi, and is differentiated through the inner gradient. TRPO (Schulman et al. 2015,
+arXiv 1502.05477) minimises it as published, or PPO by clipped steps of Adam. A = R - b has mean 0 and standard
 deviation 1 over the steps before the adaptation, or over those after it. R is the discounted rest of the episode, b a
 linear function of observation and time (Duan et al. 2016, arXiv 1604.06778), fitted to the episodes before the
 adaptation.
 
-The episodes before the adaptation get no credit for what they tell. So the policy before it may drift until it always
-goes to one goal: no other one is found then, and there is nothing to adapt to. PPO keeps it from that with
-``entropy_coeff``: it also maximises the entropy of the policy before the adaptation, with the weights of L.
+The episodes before the adaptation get no credit for what they reveal. So the policy may drift until it always goes to
+one goal and has nothing to adapt to. PPO counters this with ``entropy_coeff``: it also maximises the entropy of the
+policy before the adaptation, with the weights of L.
 
-The step of TRPO bounds the divergence of adapted policies on the episodes that were played, not that of the policy
-before the adaptation. Once all episodes after it succeed, A is only what b misses, of standard deviation 1, and a step
-is still as long as ``max_kl`` allows: the next adapted returns can fall. Both are as published.
+TRPO bounds the divergence of adapted policies on the played episodes, not that of the policy before the adaptation.
+Once all episodes after it succeed, A is only what b misses, yet a step is as long as ``max_kl`` allows: the next
+adapted returns can fall. Both are as published.
 
-All trials are one batch: `torch.func.vmap` runs over them. Weights change between batches, so it learns from trials
-that begin and end within one batch.
+`torch.func.vmap` runs over all trials as one batch. As weights change between batches, only trials that begin and end
+within one batch count.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ from torch import Tensor, nn
 from torch.func import grad, vmap
 from torch.nn.functional import one_hot
 from torchrl.data import Composite, TensorSpec
+from typing_extensions import override
 
 from baselines.parts.gates import GATES, GatedNetwork, gated_network, require_gated_weights, shown_specs
 from baselines.parts.learner import Learner
@@ -53,20 +54,20 @@ OUTER = ("trpo", "ppo")
 ACTIONS = f"{UNSTORED}actions"
 REWARDS = f"{UNSTORED}rewards"
 EPISODES = f"{UNSTORED}episodes"
-"""What a row has done since its trial began, [rows, steps]; the number of an episode that is not needed is 0."""
+"""A row's steps since its trial began, [rows, steps]; episodes that are not needed have number 0."""
 
 RIDGE = 1e-5
 """Added to the diagonal of the baseline's normal equations."""
 
 SMALLEST_STD = 1e-4
-"""Added to the standard deviation of A, which is 0 where the baseline fits all returns."""
+"""Added to the standard deviation of A, 0 where the baseline fits all returns."""
 
 NamedWeights = TensorsByName
 NetInputs = tuple[Tensor, ...]
 
 
 class Episodes(NamedTuple):
-    """What a loss reads of the steps of a trial, or of several."""
+    """What a loss reads of the steps of one or more trials."""
 
     seen: tuple[Tensor, ...]
     action: Tensor
@@ -83,14 +84,14 @@ class Played(NamedTuple):
     number: Tensor  # of the step's episode in its trial, from 1; 0 where padded, int64 [trials, steps]
 
     def weight(self) -> Tensor:
-        """Compute 1 / (E T_e) of each step, 0 where padded, [trials, steps]."""
+        """Return 1 / (E T_e) of each step, 0 where padded, [trials, steps]."""
         lengths = one_hot(self.number).sum(dim=1)
         episodes = (lengths[:, 1:] > 0).sum(dim=1, keepdim=True)
         steps = lengths.gather(1, self.number) * episodes
         return torch.where(self.number > 0, 1 / steps, 0.0)
 
     def returns(self, gamma: float) -> Tensor:
-        """Compute R, [trials, steps]."""
+        """Return R, [trials, steps]."""
         found = self.reward.clone()
         for t in reversed(range(found.shape[1] - 1)):
             lasts = self.number[:, t] == self.number[:, t + 1]
@@ -98,7 +99,7 @@ class Played(NamedTuple):
         return found
 
     def features(self, net: GatedNetwork) -> Tensor:
-        """Compute what the baseline reads: o, o^2, t, t^2, t^3 and 1, with t in 100 steps of the episode, float64."""
+        """Return the baseline's inputs: o, o^2, t, t^2, t^3 and 1, with t in 100 steps, float64."""
         begins = self.number != self.number.roll(1, dims=1)
         begins[:, 0] = True
         place, first = places(begins)
@@ -115,7 +116,7 @@ class Played(NamedTuple):
         return torch.linalg.solve(squares, inputs.mT @ returns).squeeze(-1)
 
     def advantage(self, net: GatedNetwork, gamma: float, baseline: Tensor) -> Tensor:
-        """Compute A, 0 where padded, [trials, steps]."""
+        """Return A, 0 where padded, [trials, steps]."""
         counts = (self.number > 0).double()
         number = counts.sum(dim=1, keepdim=True)
         predicted = (self.features(net) @ baseline.unsqueeze(-1)).squeeze(-1)
@@ -127,25 +128,25 @@ class Played(NamedTuple):
         return (centred / (std + SMALLEST_STD)).to(self.reward.dtype)
 
     def episodes(self, net: GatedNetwork, gamma: float, before: Played) -> Episodes:
-        """Return what a loss reads of these steps, with a baseline fitted to those ``before`` the adaptation."""
+        """Return what a loss reads, with a baseline fitted to the steps ``before`` the adaptation."""
         advantage = self.advantage(net, gamma, before.baseline(net, gamma))
         return Episodes(self.seen, self.action, advantage, self.weight().to(advantage.dtype))
 
 
 def places(begins: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the place of each step, and that of the last one up to it that ``begins``, int64 [trials, steps] each."""
+    """Return the place of each step, and of the last one up to it that ``begins``, int64 [trials, steps] each."""
     place = torch.arange(begins.shape[1], device=begins.device).expand_as(begins)
     first = torch.where(begins, place, 0).cummax(dim=1).values
     return place, first
 
 
 def log_prob(logits: Tensor, action: Tensor) -> Tensor:
-    """Compute the logarithm of the probability of actions, [...], from logits [..., num_actions]."""
+    """Return log-probabilities of actions, [...], from logits [..., num_actions]."""
     return logits.log_softmax(dim=-1).gather(-1, action.unsqueeze(-1)).squeeze(-1)
 
 
 class InnerModel(nn.Module):
-    """A network whose logits depend on weights that all trials share, theta, and on a trial's own, which adapt.
+    """A network with weights theta that all trials share, and weights of each trial, which adapt.
 
     Args:
         net: maps what is seen to logits.
@@ -163,36 +164,36 @@ class InnerModel(nn.Module):
         return dict(self.net.named_parameters())
 
     def start(self, theta: NamedWeights) -> NamedWeights:
-        """Return a trial's own weights before it has adapted."""
+        """Return a trial's weights before its adaptation."""
         raise NotImplementedError
 
     def logits(self, theta: NamedWeights, own: NamedWeights, seen: NetInputs) -> Tensor:
-        """Compute the logits of any number of steps of one trial, [..., num_actions]."""
+        """Return logits of steps of one trial, [..., num_actions]."""
         raise NotImplementedError
 
     def inner_loss(self, own: NamedWeights, theta: NamedWeights, before: Episodes) -> Tensor:
-        """Compute L of one trial, a scalar."""
+        """Return L of one trial, a scalar."""
         log_probs = log_prob(self.logits(theta, own, before.seen), before.action)
         return -(before.weight * before.advantage * log_probs).sum()
 
     def adapt(self, theta: NamedWeights, own: NamedWeights, before: Episodes) -> NamedWeights:
-        """Return a trial's own weights after a step of gradient descent on L."""
+        """Return a trial's weights after a gradient step on L."""
         gradients = grad(self.inner_loss)(own, theta, before)
         return {name: value - self.inner_rate * gradients[name] for name, value in own.items()}
 
     def adapted_logits(self, theta: NamedWeights, before: Episodes, seen: NetInputs) -> Tensor:
-        """Compute the logits of one trial's steps after its adaptation, [steps, num_actions]."""
+        """Return logits of one trial's steps after its adaptation, [steps, num_actions]."""
         own = self.adapt(theta, self.start(theta), before)
         return self.logits(theta, own, seen)
 
 
 class InnerPolicy(TensorDictModuleBase):
-    """Acts in each row with weights of the row, and lets it adapt once it has played enough episodes.
+    """Acts in each row with the row's weights, and adapts them after enough episodes.
 
     Args:
         model: the weights, and how they adapt.
         seen_keys: what the network reads.
-        adapt_episodes: episodes before the adaptation, and after it.
+        adapt_episodes: episodes before and after the adaptation.
         gamma: discount factor.
     """
 
@@ -249,7 +250,7 @@ class InnerPolicy(TensorDictModuleBase):
         return played.episodes(self.model.net, self.gamma, played)
 
     def _remember(self, data: TensorDictBase, rewards: Tensor, episode: Tensor, *, forgets: Tensor) -> None:
-        """Write what rows have done, this step included, from the first step on that a row still needs."""
+        """Write the rows' steps, from the first one that a row still needs to the present one."""
         earlier = torch.where(forgets.unsqueeze(-1), 0, data[EPISODES])
         now = torch.where(episode <= self.adapt_episodes, episode, 0)
         numbers = torch.cat([earlier, now.unsqueeze(-1)], dim=1)
@@ -303,10 +304,10 @@ class InnerLoopSettings:
 
 
 class InnerLoop(Learner):
-    """A policy that adapts within a trial; a class that derives from it says which weights do.
+    """A policy that adapts within a trial; subclasses say which weights adapt.
 
     Args:
-        settings: the fields of the class's `Settings`.
+        settings: of the class's `Settings`.
     """
 
     Settings: ClassVar[Any] = InnerLoopSettings
@@ -355,7 +356,7 @@ class InnerLoop(Learner):
         return self.policy.model
 
     def initial_state(self, num_envs: int) -> TensorDict:
-        """Return the state before the first trial; it lasts over episodes, as it has a key ``trial``."""
+        """Return the state before the first trial, which lasts over episodes by its key ``trial``."""
         theta = self.model.theta
         like = next(iter(theta.values())).detach()
         state = {
@@ -372,7 +373,7 @@ class InnerLoop(Learner):
         return TensorDict(state, batch_size=[num_envs])
 
     def minibatches(self, batch: TensorDictBase) -> Iterator[Items]:
-        """Yield the whole trials of a batch, if it has any, as often as the outer loop takes a step on them."""
+        """Yield the whole trials of a batch, if any, once for each step of the outer loop."""
         trials = self.trials(batch)
         if trials is not None:
             for _ in range(1 if self.settings.outer == "trpo" else self.settings.num_epochs):
@@ -380,10 +381,10 @@ class InnerLoop(Learner):
 
     @torch.no_grad()
     def trials(self, batch: TensorDictBase) -> Items | None:
-        """Return what the losses read of the trials that begin and end in a batch; None without one.
+        """Return what the losses read of trials within a batch; None without one.
 
-        Keys are those of `Episodes`, what was ``seen`` under its own ones, those of steps before the adaptation under
-        ``("before", key)``; and ``log_prob``, of the present weights.
+        Keys are those of `Episodes`, the keys that were ``seen``, ``("before", key)`` for steps before the adaptation,
+        and ``log_prob`` of the present weights.
         """
         number = batch["next", "trial"].squeeze(-1)
         begins = batch["is_init"].squeeze(-1) & (number == 1)
@@ -409,7 +410,7 @@ class InnerLoop(Learner):
         return found
 
     def _played(self, batch: TensorDictBase, rows: Tensor, chosen: Tensor) -> Played:
-        """Return some steps of rows, which follow each other; ``chosen`` is bool [trials, steps of the batch]."""
+        """Return steps of rows that are ``chosen``, bool [trials, steps of the batch]."""
         count = chosen.sum(dim=1, keepdim=True)
         place = torch.arange(int(count.max()), device=rows.device)
         first = chosen.int().argmax(dim=1, keepdim=True)
@@ -420,13 +421,12 @@ class InnerLoop(Learner):
         return Played(seen, batch["action"][at], batch["next", "reward"].squeeze(-1)[at], number)
 
     def _as_data(self, episodes: Episodes, *labels: str) -> Items:
-        """Return episodes by key."""
         keys = (*self.specs, *Episodes._fields[1:])
         values = (*episodes.seen, *episodes[1:])
         return {(*labels, key) if labels else key: value for key, value in zip(keys, values, strict=True)}
 
     def _adapted_logits(self, batch: Data, theta: NamedWeights | None = None) -> Tensor:
-        """Compute the logits of all trials after their adaptation, [trials, steps, num_actions]."""
+        """Return logits of all trials after their adaptation, [trials, steps, num_actions]."""
         others = [batch["before", key] for key in Episodes._fields[1:]]
         before = Episodes(self._seen_before(batch), *others)
         after = tuple(batch[key] for key in self.specs)
@@ -437,7 +437,7 @@ class InnerLoop(Learner):
         return tuple(batch["before", key] for key in self.specs)
 
     def loss(self, batch: Data) -> TensorsByName:
-        """Compute the outer loss of what `trials` returned, and that of the entropy before the adaptation."""
+        """Return the outer loss of `trials`, and the entropy's before the adaptation."""
         losses = {"loss_policy": self._outer_loss(batch, self._adapted_logits(batch))}
         if self.settings.entropy_coeff > 0:
             theta = self.model.theta
@@ -455,8 +455,8 @@ class InnerLoop(Learner):
             gain = torch.minimum(gain, clipped)
         return -(batch["weight"] * gain).sum(dim=1).mean()
 
+    @override
     def gradient_step(self, batch: Data) -> TensorsByName:
-        """Take a step of the outer loop; return what was measured."""
         if self.settings.outer == "ppo":
             measured = super().gradient_step(batch)
         else:

@@ -1,4 +1,4 @@
-"""The base class of learning agents: the order in which a batch is learned from, and what is measured."""
+"""The base class of learning agents: the order of learning from a batch, and what is measured."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ MOST_PASSES = 10**6  # over a batch, or gradient steps after it; more do not end
 
 
 class Learner(TakesNumbers, Trained):
-    """A module with an optimiser, from which agents derive; the defaults are those of an agent without memory.
+    """A module with an optimiser; the defaults are those of an agent without memory.
 
     Args:
         num_envs: environments that it learns from.
         num_steps: steps of each environment in a batch.
         max_grad_norm: gradients are scaled down to this norm.
-        compile: run gradient steps of the usual size through ``torch.compile``: faster where networks and minibatches
-            are small, after seconds of compiling. An agent with ``memory`` refuses it: an LSTM gains nothing.
+        compile: run gradient steps through ``torch.compile``: faster for small networks and minibatches, after seconds
+            of compiling. An agent with ``memory`` refuses it: an LSTM gains nothing.
     """
 
     memory: ClassVar[bool] = False
@@ -43,7 +43,7 @@ class Learner(TakesNumbers, Trained):
     """Which tasks it can solve in principle, in a few words."""
 
     output_keys: ClassVar[tuple[str, ...]]
-    """The keys of `outputs` that the network computes itself."""
+    """The keys of `outputs` that the network computes."""
 
     def __init__(self, num_envs: int, num_steps: int, max_grad_norm: float, compile: bool = False) -> None:
         super().__init__()
@@ -59,7 +59,7 @@ class Learner(TakesNumbers, Trained):
         self.max_grad_norm = max_grad_norm
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """Learn from a batch by a gradient step on each minibatch; return the mean of what is measured in them.
+        """Learn from a batch by a gradient step on each minibatch; return the mean measurements.
 
         Raises:
             FloatingPointError: names the first number that is not finite, or the largest weight.
@@ -71,34 +71,34 @@ class Learner(TakesNumbers, Trained):
         return self.after_batch(self.means(list(steps[0]), table_of(steps))) if steps else {}
 
     def minibatches(self, batch: TensorDictBase) -> Iterator[Items]:
-        """Yield the minibatches of a batch, each for one gradient step, which is taken before the next is made."""
+        """Yield minibatches, each for one gradient step, which is taken before the next is made."""
         raise NotImplementedError
 
     def gradient_step(self, batch: Data) -> TensorsByName:
-        """Minimise the sum of the losses of a minibatch by one step; return losses and ``grad_norm``."""
+        """Minimise the sum of a minibatch's losses by one step; return losses and ``grad_norm``."""
         return take_step(self, self.method.transform_minibatch(batch))
 
     def after_update(self, measured: TensorsByName) -> TensorsByName:
-        """Called after a gradient step with what was measured in it; return what is worth logging of that."""
+        """Called after a gradient step with its measurements; return those to log."""
         return measured
 
     def means(self, names: Sequence[str], table: Tensor) -> dict[str, float]:
-        """Return the means of a table of measurements, [names, gradient steps]."""
+        """Return the means of measurements, [names, gradient steps]."""
         return finite_means(names, table, torch.stack(torch._foreach_norm(list(self.parameters()), torch.inf)).max())
 
     def after_batch(self, measurements: dict[str, float]) -> dict[str, float]:
-        """Called after the last gradient step of a batch with the mean measurements; return what is worth logging."""
+        """Called after a batch with the mean measurements; return those to log."""
         return measurements
 
     def outputs(self, data: Data) -> TensorsByName:
-        """Compute the network's outputs at any number of steps, [..., n] each.
+        """Return the network's outputs at steps, [..., n] each.
 
         These are ``log_probs`` of all actions, and those of `output_keys`: ``state_value`` or ``action_value``.
         """
         raise NotImplementedError
 
     def one_step(self, data: Data) -> Items:
-        """Compute `outputs` for one step of all rows, and with memory the next state under ``("next", key)``."""
+        """Return `outputs` for one step of all rows, and with memory the next state under ``("next", key)``."""
         return dict(self.outputs(data))
 
     @property
@@ -112,7 +112,7 @@ class Learner(TakesNumbers, Trained):
 
     @property
     def unwrapped(self) -> Learner:
-        """The agent itself: no method is around it."""
+        """The agent without a method around it."""
         return self
 
     def initial_state(self, num_envs: int) -> TensorDict:
@@ -120,7 +120,7 @@ class Learner(TakesNumbers, Trained):
         return TensorDict(batch_size=[num_envs])
 
     def policy_for(self, task: int) -> TensorDictModuleBase:
-        """Return the policy, which is the same for all tasks."""
+        """Return the policy, the same for all tasks."""
         return self.policy
 
     def start_task(self, task: int | None = None) -> None:

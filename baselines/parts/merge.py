@@ -1,6 +1,6 @@
-"""Frames of one history as one: which losses sum up, so that each is computed once.
+"""Frames of one history as one: each loss that sums over them is computed once.
 
-Used on CPUs where a batch has few histories, as without noise on reading. The choice depends only on the batch.
+Used on CPUs for batches with few histories, as without noise on reading.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from baselines.parts.networks import HISTORY, Data, Items, TensorsByName
 from ctgraph_rl.learn.histories import can_branch, distinct, renumber
 
 FEWEST_FRAMES = 512
-"""Frames of a minibatch up to which each is computed: with so few, operations take the time, not what they compute."""
+"""Frames of a minibatch up to which all are computed, as operations then cost more than frames."""
 
 LARGEST_SHARE = 0.6
-"""Different histories, as a share of the frames of a batch, from which on each frame is computed."""
+"""Share of different histories in a batch from which each frame is computed."""
 
 KIND = "kind"
-"""The key of numbers of frames, int64, the same for those that `merge` makes one."""
+"""Key of frames' numbers, int64, the same for those that `merge` makes one."""
 
 
 def number_frames(trunk: Any, items: Items, num_minibatches: int) -> Items:
@@ -28,10 +28,10 @@ def number_frames(trunk: Any, items: Items, num_minibatches: int) -> Items:
     Args:
         trunk: has ``number_histories`` and ``of_histories``.
         items: its inputs, ``action``, ``action_log_prob`` and ``advantage`` of a batch, [rows, steps, ...] each.
-        num_minibatches: how many parts of the batch are learned from in turn.
+        num_minibatches: parts of the batch.
 
     Returns:
-        Keys for the items; none where each frame is to be computed.
+        Keys for the items; empty where each frame is to be computed.
     """
     action = items["action"]
     if action.numel() <= FEWEST_FRAMES * num_minibatches or not can_branch(action):
@@ -47,7 +47,7 @@ def number_frames(trunk: Any, items: Items, num_minibatches: int) -> Items:
 
 
 def merged_outputs(policy: Any, trunk: Any, batch: Data) -> tuple[Data, TensorsByName]:
-    """Return frames of a batch and the network's outputs at them: all frames, or one of each kind; see `merge`."""
+    """Return frames of a batch, all or one of each kind of `merge`, and the network's outputs at them."""
     if KIND not in batch:
         return batch, policy.outputs(batch)
     chosen, frames = merge(batch)
@@ -57,11 +57,11 @@ def merged_outputs(policy: Any, trunk: Any, batch: Data) -> tuple[Data, TensorsB
 
 
 def merge(batch: Data) -> tuple[Tensor, Items]:
-    """Merge the frames of each kind, which have the same history, action, old log-probability and sign of advantage.
+    """Merge frames of the same history, action, old log-probability and sign of advantage.
 
-    They have one probability ratio and one value V. So a loss of them is n times the same function of their mean
-    advantage, and the squares of a critic are n (V - m)^2 + S, where m is their mean target and S the squares around
-    it. Means are float64: V is near m when trained, and advantages cancel.
+    They have one probability ratio and one value V. So their loss is n times that of their mean advantage, and a
+    critic's squares are n (V - m)^2 + S, where m is their mean target and S the squares around it. Means are float64: V
+    is near m when trained, and advantages cancel.
 
     Returns:
         A frame of each kind, int64 [num_kinds]; and its action, old log-probability, mean ``advantage`` and
@@ -80,6 +80,6 @@ def merge(batch: Data) -> tuple[Tensor, Items]:
 
 
 def mean(values: Tensor, frames: Data) -> Tensor:
-    """Return the mean of values over frames, each as often as it counts; see `merge`."""
+    """Return the mean of values over frames, weighted by their ``count``."""
     count = frames.get("count")
     return values.mean() if count is None else (values.flatten() * count).sum() / count.sum()

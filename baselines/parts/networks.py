@@ -27,22 +27,22 @@ Data = Mapping[Any, Tensor]
 """Tensors by key, in a dictionary or a TensorDict."""
 
 Items = dict[Any, Tensor]
-"""Tensors by key, whose first dimension is that of a batch."""
+"""Tensors by key, whose first dimension is a batch's."""
 
 TensorsByName = dict[str, Tensor]
 """Such as losses, outputs and weights."""
 
 INPUT = "input_number"
-"""The key of numbers of frames, int64, the same for frames with the same inputs."""
+"""Key of frames' numbers, int64, the same for the same inputs."""
 
 FEWEST_ROWS = 128
-"""Rows from which on it pays to look for those with the same history when acting."""
+"""Rows from which acting looks for equal histories."""
 
 MOST_ROWS = 0.25
-"""Share of rows with different histories up to which it pays to act once for each history."""
+"""Share of different histories up to which acting computes each once."""
 
 HISTORY = "history_number"
-"""The key of numbers of frames, int64, the same for frames with the same history; without memory, the same inputs."""
+"""Key of frames' numbers, int64, the same for the same history; without memory, for the same inputs."""
 
 
 ENCODERS = ("mlp", "cnn")
@@ -51,9 +51,9 @@ NUM_CHANNELS = 16
 
 
 class Convolutions(nn.Module):
-    """Two convolutions with ReLU: of 4 x 4 pixels at a stride of 4, then of 3 x 3 of their outputs with zeros around.
+    """Two convolutions with ReLU: of 4 x 4 pixels at a stride of 4, then of 3 x 3 with zeros around.
 
-    Each is a linear layer over patches: methods and stacks treat its weights as those of any linear layer.
+    Each is a linear layer over patches, so methods and stacks treat it as one.
 
     Args:
         shape: channels, rows and columns of an image; rows and columns are multiples of 4.
@@ -147,31 +147,31 @@ class Encoder(nn.Module):
 
 
 class EncoderModule(TensorDictModule):
-    """A trunk without memory: an `Encoder` and the keys that it reads; writes ``features``."""
+    """A trunk without memory: an `Encoder` and its keys; writes ``features``."""
 
     def act(self, data: Data) -> Items:
-        """Compute ``features`` for one step of all rows."""
+        """Return ``features`` for one step of all rows."""
         return {"features": self.over_time(data)}
 
     def over_time(self, data: Data) -> Tensor:
-        """Compute the features of any number of steps."""
+        """Return the features of any number of steps."""
         return self.module(*(data[key] for key in self.in_keys))
 
     def number_histories(self, data: Data) -> Items:
-        """Number the inputs of frames, [rows, steps] of them, from 0; int64 [rows, steps]."""
+        """Number the inputs of frames from 0, int64 [rows, steps]."""
         inputs = [data[key] for key in self.in_keys]
         _, groups = distinct([value.flatten(0, 1) for value in inputs])
         return {HISTORY: groups.view(inputs[0].shape[:2])}
 
     def of_histories(self, data: Data) -> tuple[Tensor, Tensor]:
-        """Compute features of different frames, [n, num_features], and which of them each has, int64 [num_frames]."""
+        """Return features of different frames, [n, num_features], and the number of each frame's, int64 [num_frames]."""
         examples, groups = renumber(data[HISTORY])
         features = self.module(*(data[key].index_select(0, examples) for key in self.in_keys))
         return features, groups
 
 
 class RecurrentModule(TensorDictModuleBase):
-    """An encoder with a cell behind it; writes ``memory``, and the cell's state under the cell's keys.
+    """An encoder and a cell; writes ``memory``, and the cell's state under the cell's keys.
 
     `act` is one step of all rows, `over_time` all steps of sequences.
 
@@ -204,7 +204,7 @@ class RecurrentModule(TensorDictModuleBase):
         return tensordict.update(written)
 
     def act(self, data: Data) -> Items:
-        """Compute ``memory`` and the next state for one step of all rows, once for rows with the same history."""
+        """Return ``memory`` and the next state for one step, computed once for rows with the same history."""
         seen = [data[key] for key in self.encoder.in_keys]
         own = self._own(data)
         state = reset([data[key] for key in self.state_keys], data["is_init"].squeeze(-1))
@@ -224,24 +224,21 @@ class RecurrentModule(TensorDictModuleBase):
         return written
 
     def over_time(self, data: Data) -> Tensor:
-        """Compute ``memory`` at all steps of [rows, steps], from the state at the first; reset at ``is_init``.
-
-        Features are computed once for frames with the same inputs.
-        """
+        """Return ``memory`` at all steps of [rows, steps], from the state at the first; reset at ``is_init``."""
         inputs, groups, starts, state = self._sequences(data)
         cell = self.cell
         faster = cell.sequence if can_branch(starts) else partial(Cell.sequence, cell)
         return faster(inputs, groups, starts, state)
 
     def of_histories(self, data: Data) -> tuple[Tensor, Tensor]:
-        """Compute ``memory`` of different histories, [n, num_outputs], and which each frame has, [rows * steps]."""
+        """Return ``memory`` of different histories, [n, num_outputs], and the number of each frame's, [rows * steps]."""
         inputs, groups, starts, state = self._sequences(data)
         found = histories.tree(data[HISTORY], starts)
         of_last = groups.flatten().index_select(0, found.frames)
         return self.cell.over_tree(found, inputs, of_last, found.initial(starts, state)), found.of_frames
 
     def number_histories(self, data: Data) -> Items:
-        """Number the inputs and the histories of frames, [rows, steps] of them, from 0; int64 [rows, steps] each."""
+        """Number the inputs and the histories of frames from 0; int64 [rows, steps] each."""
         seen, own = self._read(data)
         starts = data["is_init"].squeeze(-1)
         _, groups = distinct([*seen, *own])
@@ -250,12 +247,12 @@ class RecurrentModule(TensorDictModuleBase):
         return {INPUT: inputs, HISTORY: histories.number_histories(inputs, starts, state)}
 
     def _read(self, data: Data) -> tuple[list[Tensor], list[Tensor]]:
-        """Return what the encoder reads at all frames, [rows * steps, ...] each, and what the cell reads beside it."""
+        """Return what the encoder reads at all frames, [rows * steps, ...] each, and the cell's other inputs."""
         seen = [data[key].flatten(0, 1) for key in self.encoder.in_keys]
         return seen, [value.flatten(0, 1) for value in self._own(data)]
 
     def _sequences(self, data: Data) -> tuple[Tensor, Tensor, Tensor, CellState]:
-        """Return what the cell reads, one for all frames with the same inputs; see `Cell.sequence`."""
+        """Return what `Cell.sequence` reads, one for all frames with the same inputs."""
         starts = data["is_init"].squeeze(-1)
         seen, own = self._read(data)
         examples, groups = renumber(data[INPUT].flatten()) if INPUT in data else distinct([*seen, *own])
@@ -265,7 +262,7 @@ class RecurrentModule(TensorDictModuleBase):
         return inputs, groups.view_as(starts), starts, state
 
     def zero_state(self, num_envs: int) -> TensorDict:
-        """Return the state before the first step: the cell's zeros, and no last action or reward."""
+        """Return the state before the first step: zeros, without last action or reward."""
         state = dict(zip(self.state_keys, self.cell.zeros(num_envs), strict=True))
         device = next(self.parameters()).device
         zeros = {
@@ -275,7 +272,7 @@ class RecurrentModule(TensorDictModuleBase):
         return TensorDict(state | {key: zeros[key] for key in self.own_keys}, batch_size=[num_envs])
 
     def _own(self, data: Data) -> list[Tensor]:
-        """Return the last action, one-hot, and the last reward, as far as the cell reads them; 0 at ``is_init``."""
+        """Return the last action, one-hot, and the last reward, if the cell reads them; 0 at ``is_init``."""
         found = []
         for key in self.own_keys:
             value = one_hot(data[key], self.cell.num_actions).float() if key == PREVIOUS_ACTION else data[key]
@@ -284,7 +281,7 @@ class RecurrentModule(TensorDictModuleBase):
 
 
 def trunk_of(policy: object) -> Any:
-    """Return the part of a policy before its output layers, which has ``over_time`` and ``in_keys``; None without."""
+    """Return a policy's part before its output layers, with ``over_time`` and ``in_keys``, or None."""
     parts = policy.modules() if isinstance(policy, nn.Module) else ()
     return next((part for part in parts if hasattr(part, "over_time")), None)
 
@@ -295,20 +292,20 @@ def joined(features: Tensor, *others: Tensor) -> Tensor:
 
 
 def copied_action(keys: Sequence[str]) -> list[TensorDictModule]:
-    """Return what a policy ends with if its trunk reads the last action: a module that copies ``action`` for it."""
+    """Return the module that copies ``action`` for a trunk that reads the last one, if it does."""
     copy = TensorDictModule(nn.Identity(), in_keys=["action"], out_keys=[("next", PREVIOUS_ACTION)])
     return [copy] * (PREVIOUS_ACTION in keys)
 
 
 def sequences_of(batch: Data, keys: Sequence[str], states: Sequence[str] = ()) -> TensorsByName:
-    """Return inputs of a batch, [rows, steps, ...] each; of ``states`` and of what is not stored, the first step's."""
+    """Return inputs of a batch, [rows, steps, ...] each; only the first step's of ``states`` and unstored keys."""
     return {key: batch[key][:, :1] if key.startswith(UNSTORED) or key in states else batch[key] for key in keys}
 
 
 def require_weights(
     observation_spec: Composite, hidden_size: int, num_layers: int = 1, num_outputs: int = 1, memory: bool = False
 ) -> None:
-    """Refuse networks whose weights, gradients and moments of Adam the machine cannot hold.
+    """Refuse networks whose weights, gradients and moments of Adam exceed the memory.
 
     Raises:
         ValueError: names the layers and the bytes.
@@ -320,7 +317,7 @@ def require_weights(
 
 
 def num_actions_of(action_spec: TensorSpec) -> int:
-    """Return the number of actions that an agent chooses from.
+    """Return the number of actions.
 
     Raises:
         ValueError: for continuous actions.
@@ -334,7 +331,7 @@ def num_actions_of(action_spec: TensorSpec) -> int:
 
 
 def highest(spec: TensorSpec) -> float:
-    """Return what observations are divided by: their largest value, or 1 for vectors of floats."""
+    """Return the divisor of observations: their largest value, or 1 for vectors of floats."""
     return 1.0 if spec.dtype.is_floating_point else spec.space.high.max().item()
 
 
@@ -377,7 +374,7 @@ def recurrent(
     kind: str = "mlp",
     **extra: int,
 ) -> RecurrentModule:
-    """Build an `encoder` with a cell of the same width; it writes ``memory``, and its state under the cell's keys."""
+    """Build an `encoder` with a cell of the same width; it writes ``memory`` and the cell's state."""
     cell = make_cell(num_features, num_features, num_actions)  # first, as the order decides the weights of a seed
     return RecurrentModule(encoder(observation_spec, num_features, num_layers, kind=kind, **extra), cell)
 
@@ -388,7 +385,7 @@ def linear(in_key: str, num_features: int, out_key: str, num_outputs: int) -> Te
 
 
 def make_orthogonal(trunk: nn.Module, *heads: nn.Module) -> None:
-    """Initialise linear layers with orthogonal weights, those of heads a thousand times smaller, and biases of 0.
+    """Initialise linear layers with orthogonal weights, a thousand times smaller in heads, and biases of 0.
 
     As in the code of Ben-Iwhiwhu et al. 2023.
     """
@@ -400,7 +397,7 @@ def make_orthogonal(trunk: nn.Module, *heads: nn.Module) -> None:
 
 
 def actor(in_key: str, num_features: int, action_spec: TensorSpec) -> ProbabilisticActor:
-    """Build a categorical policy that reads features and writes ``action`` and ``action_log_prob``."""
+    """Build a categorical policy of features; writes ``action`` and ``action_log_prob``."""
     return ProbabilisticActor(
         linear(in_key, num_features, "logits", num_actions_of(action_spec)),
         spec=action_spec,
@@ -411,15 +408,15 @@ def actor(in_key: str, num_features: int, action_spec: TensorSpec) -> Probabilis
 
 
 def critic(in_key: str, num_features: int) -> ValueOperator:
-    """Build a linear critic of features, which writes ``state_value``."""
+    """Build a linear critic of features; writes ``state_value``."""
     return ValueOperator(linear_layer(num_features, 1), in_keys=[in_key])
 
 
 class ActorCritic(TensorDictSequential):
-    """A policy of a trunk, an `actor` and a `critic`; computes what TorchRL's modules do, in plain tensors."""
+    """A policy of trunk, `actor` and `critic`, which computes TorchRL's results in plain tensors."""
 
     capturable = True
-    """Whether it acts without a branch on data; see `ctgraph_rl.learn.collect.CapturedAct`."""
+    """Whether it acts without a branch on data, as `ctgraph_rl.learn.collect.CapturedAct` needs."""
 
     def __init__(self, trunk: TensorDictModuleBase, actor: ProbabilisticActor, critic: ValueOperator) -> None:
         [features] = actor.in_keys
@@ -429,21 +426,21 @@ class ActorCritic(TensorDictSequential):
             keys += module.out_keys
         super().__init__(trunk, actor, critic, *copied, selected_out_keys=keys)
         self._parts = trunk, features, actor.module[0].module, critic.module, copied
-        """What acting needs of the modules, which takes 30 µs to find."""
+        """What acting needs of the modules; looking it up takes 30 µs."""
 
     def outputs(self, data: Data) -> TensorsByName:
-        """Compute ``log_probs`` of all actions and ``state_value`` at any number of steps, [..., n] each."""
+        """Return ``log_probs`` of all actions and ``state_value`` at any number of steps, [..., n] each."""
         return self.heads(self._parts[0].over_time(data))
 
     def one_step(self, data: Data) -> Items:
-        """Compute `outputs` for one step of all rows, and with memory the next state under ``("next", key)``."""
+        """Return `outputs` for one step of all rows, and with memory the next state under ``("next", key)``."""
         trunk, key, *_ = self._parts
         written = trunk.act(data)
         features = written.pop(key)
         return {**written, **self.heads(features)}
 
     def heads(self, features: Tensor) -> TensorsByName:
-        """Compute `outputs` from what the trunk computes."""
+        """Return `outputs` from the trunk's features."""
         _, _, logits, value, _ = self._parts
         return {"log_probs": log_probabilities(logits(features)), "state_value": value(features)}
 
@@ -454,14 +451,14 @@ class ActorCritic(TensorDictSequential):
         return tensordict
 
     def action_probs(self, data: Data) -> tuple[Tensor, Items]:
-        """Return the probabilities of actions, and the trunk's next state; see `ctgraph_rl.agent.Agent`."""
+        """Return action probabilities and the trunk's next state, as `ctgraph_rl.agent.Agent`."""
         trunk, key, logits, *_ = self._parts
         written = trunk.act(data)
         chances = _normalised(logits(written.pop(key))).softmax(dim=-1)
         return most_likely(chances) if is_greedy() else chances, written
 
     def act_on_tensors(self, data: Data) -> Items:
-        """Return what `forward` writes; see `ctgraph_rl.learn.collect.act`."""
+        """Return what `forward` writes, for `ctgraph_rl.learn.collect.act`."""
         trunk, key, logits, value, others = self._parts
         written = trunk.act(data)
         features = written.pop(key)
@@ -479,13 +476,13 @@ class ActorCritic(TensorDictSequential):
 
 
 def guided(data: Data, action: Tensor) -> Tensor:
-    """Return the actions that a guide gave, int64 [num_envs], and where it gave none the policy's own."""
+    """Return a guide's actions, int64 [num_envs], or the policy's where it gave none."""
     given = data.get(GUIDED_ACTION, None)
     return action if given is None else torch.where(given < 0, action, given)
 
 
 def is_greedy() -> bool:
-    """Return whether policies take their best action at present, as TorchRL's exploration type says."""
+    """Return whether TorchRL's exploration type asks for best actions."""
     return exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE)
 
 
@@ -495,25 +492,25 @@ def most_likely(values: Tensor) -> Tensor:
 
 
 def draw(chances: Tensor) -> Tensor:
-    """Draw a number of each categorical distribution, [..., n], int64 [...].
+    """Draw from categorical distributions, [..., n], int64 [...].
 
-    The same as `torch.multinomial` draws, without its checks: a fifth of the time, and no wait of the host for a GPU.
+    Draws as `torch.multinomial` without checks: a fifth of the time, and no wait for a GPU.
     """
     return (chances / torch.empty_like(chances).exponential_()).argmax(dim=-1)
 
 
 def log_probabilities(logits: Tensor) -> Tensor:
-    """Compute the logarithms of categorical probabilities, [..., n]."""
+    """Return logarithms of categorical probabilities, [..., n]."""
     return logits - logits.logsumexp(dim=-1, keepdim=True)
 
 
 def _normalised(logits: Tensor) -> Tensor:
-    """Compute `log_probabilities` of finite logits, [..., n], in half the operations; for acting, without gradients."""
+    """Return `log_probabilities` of finite logits, [..., n], without gradients in half the operations."""
     most = logits.amax(dim=-1, keepdim=True)
     return logits - (logits - most).exp().sum(dim=-1, keepdim=True).log().add(most)
 
 
 def entropy(log_probs: Tensor) -> Tensor:
-    """Compute the entropy of categorical distributions, [...]."""
+    """Return the entropy of categorical distributions, [...]."""
     least = torch.finfo(log_probs.dtype).min  # so that a probability of 0 counts as 0
     return -(log_probs.clamp(min=least) * log_probs.softmax(dim=-1)).sum(dim=-1)

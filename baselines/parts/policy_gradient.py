@@ -40,7 +40,7 @@ SMALLEST_DECAY = 1e-6  # TorchRL's advantages leave out terms below 1e-7, and ne
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyGradientSettings:
-    """The settings of `PolicyGradient`, which an agent extends by its own."""
+    """The settings of `PolicyGradient`, which agents extend."""
 
     num_envs: int  # environments that it learns from
     num_steps: int  # steps of each environment in a batch
@@ -73,22 +73,21 @@ class PolicyGradientSettings:
 
 
 class Seeds(NamedTuple):
-    """Whose rows a batch has: those of one agent, or the same number of each of several."""
+    """Whose rows a batch has: one agent's, or equally many of several."""
 
     number: int
     values: Callable[[Items], Tensor]
-    """Computes the values, [n, 1], at n frames of all seeds, the same number of each."""
+    """Computes the values, [n, 1], at n frames of all seeds."""
 
     orders: Callable[[int], Tensor]
-    """Draws an order of so many items for each seed, int64 [seeds, items]; or for one, [items]."""
+    """Draws an order of items for each seed, int64 [seeds, items]; for one, [items]."""
 
 
 class PolicyGradient(Learner):
-    """An actor and a critic on one trunk; a class that derives from it defines the loss.
+    """An actor and a critic on one trunk; subclasses define the loss.
 
-    Without memory, the frames of all rows are shuffled into minibatches. With memory, the trunk ends in a cell, whose
-    state is reset wherever ``is_init`` is set, and minibatches are whole rows, so it sees sequences in order. Settings
-    are the fields of the class's ``Settings``.
+    Without memory, minibatches are shuffled frames. With memory, the trunk ends in a cell that resets at ``is_init``,
+    and minibatches are whole rows, so it sees sequences in order. Settings are the fields of the class's ``Settings``.
     """
 
     Settings: ClassVar[Any] = PolicyGradientSettings
@@ -119,7 +118,7 @@ class PolicyGradient(Learner):
         return (self.num_envs if self.memory else self.num_envs * self.num_steps) // self.num_minibatches
 
     def make_trunk(self, observation_spec: Composite, action_spec: TensorSpec, **extra: int) -> TensorDictModuleBase:
-        """Build the layers before the heads, which with memory end in a cell; ``extra`` as of `networks.encoder`."""
+        """Build the layers before the heads, with memory ending in a cell; ``extra`` as in `networks.encoder`."""
         given = self.settings
         sizes = given.hidden_size, given.num_layers
         if not self.memory:
@@ -139,9 +138,9 @@ class PolicyGradient(Learner):
             networks.make_orthogonal(self.trunk, self.actor, self.critic)
 
     def evaluate_actions(self, batch: Data) -> tuple[Data, Tensor, Tensor, Tensor]:
-        """Compute log-probabilities of all actions, those of the actions taken, and values, with present weights.
+        """Return frames, log-probabilities of all actions, of the taken ones, and values, by the present weights.
 
-        They are those of the frames that come first: of the batch, or of one of each kind; see `merge`.
+        The frames are all of the batch, or one of each kind of `merge`.
         """
         frames, outputs = merged_outputs(self.policy, self.trunk, batch)
         log_probs = outputs["log_probs"]
@@ -156,12 +155,12 @@ class PolicyGradient(Learner):
         return self.policy.one_step(data)
 
     def minibatches(self, batch: TensorDictBase) -> Iterator[Items]:
-        """Yield the minibatches of all epochs, with advantages from the values that were computed while acting."""
+        """Yield the minibatches of all epochs, with advantages from the values while acting."""
         for minibatch in self.minibatches_of(batch, self.one_seed):
             yield {key: value[0] for key, value in minibatch.items()}
 
     def minibatches_of(self, batch: TensorDictBase, seeds: Seeds) -> Iterator[Items]:
-        """Yield the minibatches of several seeds, [seeds, frames or rows, ...] each; ``batch`` has all their rows."""
+        """Yield minibatches of several seeds, [seeds, frames or rows, ...] each; ``batch`` has all their rows."""
         items = {}
         for key, value in self.with_advantage(batch, seeds).items():
             of_seeds = value.unflatten(0, (seeds.number, -1))
@@ -179,20 +178,20 @@ class PolicyGradient(Learner):
 
     @property
     def one_seed(self) -> Seeds:
-        """This agent, as the only seed."""
+        """This agent as the only seed."""
         draw_order = partial(torch.randperm, device=self.critic.module.weight.device)
         return Seeds(1, lambda data: self.one_step(data)["state_value"], draw_order)
 
     def reward(self, batch: TensorDictBase) -> Tensor:
-        """Return the reward to maximise, float32 [num_envs, num_steps, 1]: the environment's."""
+        """Return the environment's reward, to be maximised, float32 [num_envs, num_steps, 1]."""
         return batch["next", "reward"]
 
     @torch.no_grad()
     def with_advantage(self, batch: TensorDictBase, seeds: Seeds) -> TensorsByName:
-        """Return inputs and actions of a batch, ``advantage`` and ``value_target``, [rows, steps, ...] each.
+        """Return inputs, actions, ``advantage`` and ``value_target`` of a batch, [rows, steps, ...] each.
 
-        The value after a step is the one that was computed while acting at the next step. After the last step of the
-        batch, and where an episode was truncated, it is computed here. Where one has terminated, it is not used.
+        The value after a step is that of the next step while acting. It is computed here after the batch's last step
+        and where an episode was truncated, and unused where one has terminated.
         """
         values = batch["state_value"]
         after = batch["next"]
@@ -226,26 +225,26 @@ class PolicyGradient(Learner):
     def advantages(
         self, batch: TensorDictBase, next_values: Tensor, done: Tensor, terminated: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Compute the advantages and the critic's targets; each argument and result is [rows, steps, 1]."""
+        """Return advantages and the critic's targets; all are [rows, steps, 1]."""
         given = (batch["state_value"], next_values, self.reward(batch), done, terminated)
         return generalized_advantages(self.settings.gamma, self.settings.gae_lambda, *given)
 
 
 def generalized_advantages(gamma: float, gae_lambda: float, *given: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute advantages and value targets; TorchRL's faster way makes the host wait for a GPU."""
+    """Return advantages and value targets; TorchRL's faster way makes the host wait for a GPU."""
     estimate = vec_generalized_advantage_estimate if given[0].is_cpu else generalized_advantage_estimate
     with torchs_defaults():  # TorchRL multiplies flags by numbers, which gives torch's default dtype
         return estimate(gamma, gae_lambda, *given)
 
 
 def critic_loss(values: Tensor, frames: Data, weight: float) -> Tensor:
-    """Compute the critic's weighted mean squared error."""
+    """Return the critic's weighted mean squared error."""
     loss = mean(weight * (values - frames["value_target"]).square(), frames)
     spread = frames.get("spread")
     return loss if spread is None else loss + weight * spread
 
 
 def entropy_loss(log_probs: Tensor, frames: Data, weight: float) -> TensorsByName:
-    """Return the negative weighted entropy of the policy as a loss, and the entropy."""
+    """Return the policy's negative weighted entropy as a loss, and its entropy."""
     entropies = networks.entropy(log_probs)
     return {"loss_entropy": mean(-weight * entropies, frames), "entropy": mean(entropies.detach(), frames)}

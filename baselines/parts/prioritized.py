@@ -1,8 +1,7 @@
 """Proportional prioritized replay (Schaul et al. 2016, arXiv 1511.05952) as a TorchRL sampler in plain PyTorch.
 
-TorchRL's own sampler keeps segment trees of an extension that is not available for every version of PyTorch, and it
-draws from numpy's generator. A draw here costs a pass over the priorities, little beside a gradient step below a size
-of 10^6.
+TorchRL's sampler needs an extension that not every version of PyTorch has, and draws from numpy's generator. A draw
+costs a pass over the priorities, little beside a gradient step below a size of 10^6.
 """
 
 from __future__ import annotations
@@ -13,22 +12,22 @@ import torch
 from torch import Tensor
 from torchrl.data.replay_buffers import Storage
 from torchrl.data.replay_buffers.samplers import Sampler
+from typing_extensions import override
 
 LARGEST_ALPHA = 4
-"""Beyond it the powers of errors leave the range of float32; Schaul et al. use 0.6 and 0.7."""
+"""Beyond it powers of errors leave the range of float32; Schaul et al. use 0.6 and 0.7."""
 
 
 class PrioritySampler(Sampler):
     """Draws item i with probability p_i^alpha / sum p^alpha, with replacement, from torch's global generator.
 
-    A new item has the largest priority so far. Each item comes with ``priority_weight``, at most 1:
-    (p_i^alpha / min p^alpha)^-beta.
+    A new item has the largest priority so far. Items come with ``priority_weight`` (p_i^alpha / min p^alpha)^-beta, at
+    most 1.
 
     Args:
         num_items: capacity of the storage.
         alpha: exponent of the priorities.
-        beta: exponent of the weights, which correct for alpha. It is constant here; Schaul et al. raise it to 1 over
-            training.
+        beta: exponent of the weights; constant, where Schaul et al. raise it to 1.
     """
 
     def __init__(self, num_items: int, alpha: float, beta: float) -> None:
@@ -43,8 +42,8 @@ class PrioritySampler(Sampler):
 
     add = extend
 
+    @override
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Tensor]]:
-        """Draw items, and return their indices and weights."""
         chances = self.priorities[: len(storage)] ** self.alpha
         index = torch.multinomial(chances, batch_size, replacement=True)
         return index, {"priority_weight": (chances[index] / chances.min()) ** -self.beta}
@@ -55,12 +54,12 @@ class PrioritySampler(Sampler):
         self.most = torch.maximum(self.most, priority.max())
         return None
 
+    @override
     def state_dict(self) -> dict[str, Any]:
-        """Return all priorities."""
         return {"priorities": self.priorities.clone(), "most": self.most.clone()}
 
+    @override
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
         self.priorities.copy_(state_dict["priorities"])
         self.most = state_dict["most"].clone()
 

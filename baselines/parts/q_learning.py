@@ -37,17 +37,17 @@ from ctgraph_rl.checks import (
 from ctgraph_rl.core.device import torchs_defaults
 
 LONGEST_TARGET = 10**4
-"""Most steps of a multi-step target: beyond any episode that replay can hold, and held as a table."""
+"""Most steps of a multi-step target, beyond any episode that replay can hold."""
 
 
 def require_replay(observation_spec: Composite, buffer_size: int, batch_size: int, size: int = 1) -> None:
-    """Refuse a replay buffer, and minibatches of it, that the machine cannot hold.
+    """Refuse a replay buffer and minibatches that exceed the memory.
 
     Args:
         observation_spec: the environment's, without batch dimensions.
         buffer_size: steps in the buffer.
         batch_size: items of a minibatch.
-        size: numbers that an item of a minibatch takes beside its observations.
+        size: numbers of an item beside its observations.
 
     Raises:
         ValueError: names the sizes and the bytes.
@@ -59,7 +59,7 @@ def require_replay(observation_spec: Composite, buffer_size: int, batch_size: in
 
 
 class Exploration(EGreedyModule):
-    """TorchRL's epsilon-greedy exploration, float32 on the CPU whatever torch's defaults are; for whole numbers.
+    """TorchRL's epsilon-greedy exploration for whole numbers, float32 on the CPU.
 
     Args:
         action_spec: the actions to draw from.
@@ -74,7 +74,7 @@ class Exploration(EGreedyModule):
             setattr(self, name, torch.tensor(value, dtype=torch.float32, device="cpu"))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Replace some of the actions by random ones, unless actions are to be greedy."""
+        """Replace some actions by random ones, unless actions are greedy."""
         if exploration_type() in (ExplorationType.RANDOM, None):
             action = tensordict["action"]
             explores = torch.rand(action.shape, dtype=torch.float32, device=self.eps.device) < self.eps
@@ -84,7 +84,7 @@ class Exploration(EGreedyModule):
 
 
 class EpsilonGreedy(TensorDictSequential):
-    """A `QValueActor` of a trunk and a head, with exploration; computes what TorchRL's does, in plain tensors."""
+    """A `QValueActor` of trunk, head and exploration, which computes TorchRL's results in plain tensors."""
 
     def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
         """Write ``action`` and the trunk's next state."""
@@ -100,7 +100,7 @@ class EpsilonGreedy(TensorDictSequential):
         return tensordict
 
     def action_probs(self, data: Data) -> tuple[Tensor, Items]:
-        """Return the probabilities of actions, and the trunk's next state; see `ctgraph_rl.agent.Agent`."""
+        """Return action probabilities and the trunk's next state, as `ctgraph_rl.agent.Agent`."""
         values, written = self._act(data)
         greedy = most_likely(values)
         if is_greedy():
@@ -109,7 +109,7 @@ class EpsilonGreedy(TensorDictSequential):
         return (1 - eps) * greedy + eps / values.shape[-1], written
 
     def _act(self, data: Data) -> tuple[Tensor, Items]:
-        """Return the action values, [num_envs, num_actions], and the trunk's next state."""
+        """Return action values, [num_envs, num_actions], and the trunk's next state."""
         trunk, head = self.module[0].module[0].module
         written = trunk.act(data)
         values = head.module(written.pop(head.in_keys[0]))
@@ -118,7 +118,7 @@ class EpsilonGreedy(TensorDictSequential):
 
 @dataclass(frozen=True, kw_only=True)
 class QLearnerSettings:
-    """The settings of `QLearner`, which an agent extends by its own."""
+    """The settings of `QLearner`, which agents extend."""
 
     num_envs: int  # environments that it learns from
     num_steps: int  # steps of each environment between two rounds of updates
@@ -156,13 +156,13 @@ class QLearnerSettings:
 
 
 class QLearner(Learner):
-    """Learns action values from replayed experience; explores by random actions, less and less within a task.
+    """Learns action values from replay; explores by random actions, less and less within a task.
 
-    A class that derives from it calls `set_networks`, and defines `require_room`, `experience` and the loss. A loss
-    that takes ``others`` gets the target network's weights, for `with_others`.
+    Subclasses call `set_networks` and define `require_room`, `experience` and the loss. A loss that takes ``others``
+    gets the target network's weights.
 
     Args:
-        settings: the fields of the class's `Settings`.
+        settings: of the class's `Settings`.
     """
 
     Settings: ClassVar[Any] = QLearnerSettings
@@ -185,7 +185,7 @@ class QLearner(Learner):
         self.replay = TensorDictReplayBuffer(storage=storage, sampler=sampler, batch_size=given.batch_size)
 
     def require_room(self, observation_spec: Composite, num_actions: int) -> None:
-        """Refuse networks and replay that the machine cannot hold."""
+        """Refuse networks and replay that exceed the memory."""
         raise NotImplementedError
 
     def make_sampler(self, size: int) -> Any:
@@ -203,13 +203,13 @@ class QLearner(Learner):
         *state: Any,
         copied: Sequence[TensorDictModule] = (),
     ) -> None:
-        """Set the network that acts and learns, its target network and the exploration.
+        """Set the acting network, its target network and the exploration.
 
         Args:
             greedy: writes the best ``action``.
             action_spec: the actions that exploration draws from.
-            state: keys under which the network writes its recurrent state.
-            copied: what `copied_action` returns for the network.
+            state: keys of the network's recurrent state.
+            copied: from `copied_action`.
         """
         eps = float(self.settings.eps_init), float(self.settings.eps_end)
         self.exploration = Exploration(action_spec, *eps, self.annealing_batches)
@@ -238,16 +238,16 @@ class QLearner(Learner):
         self.target_age = 0
 
     def values(self, data: Data) -> Tensor:
-        """Compute the network's action values, [..., num_actions]."""
+        """Return the network's action values, [..., num_actions]."""
         raise NotImplementedError
 
     def outputs(self, data: Data) -> TensorsByName:
-        """Compute the action values, and the log-probabilities of their softmax; see `Learner`."""
+        """Return the action values, and the log-probabilities of their softmax."""
         values = self.values(data)
         return {"log_probs": values.log_softmax(dim=-1), "action_value": values}
 
     def with_targets(self, batch: TensorDictBase) -> TensorDictBase:
-        """Return a batch with multi-step rewards, what follows them, and how many steps they span."""
+        """Return a batch with multi-step rewards, what follows them, and the steps that they span."""
         with torchs_defaults():  # TorchRL's powers of the discount have torch's default dtype
             return self.multi_step(batch)
 
@@ -256,7 +256,7 @@ class QLearner(Learner):
         raise NotImplementedError
 
     def minibatches(self, batch: TensorDictBase) -> Iterator[Items]:
-        """Store a batch, and yield minibatches of replayed items, as ``replay.sample()`` does, in plain tensors."""
+        """Store a batch, and yield replayed minibatches, as ``replay.sample()`` in plain tensors."""
         self.replay.extend(self.experience(self.with_targets(batch)))
         storage = self.replay.storage
         device = next(self.parameters()).device
@@ -269,7 +269,7 @@ class QLearner(Learner):
             yield items
 
     def after_update(self, measured: TensorsByName) -> TensorsByName:
-        """Set the priorities of the replayed items, and copy the weights to the target network if it is time."""
+        """Set the priorities of replayed items, and copy the weights to the target network if due."""
         squared = measured.pop("td_error", None)
         if self.prioritized and squared is not None:
             self.means(list(measured), table_of([measured]))  # raises before a priority becomes NaN
@@ -286,11 +286,11 @@ class QLearner(Learner):
 
     @property
     def needs_weights(self) -> bool:
-        """Whether the target network gets the weights after the next gradient step."""
+        """Whether the target network is due after the next gradient step."""
         return self.prioritized or self.target_age == self.settings.target_update_interval - 1
 
     def get_extra_state(self) -> NamedValues:
-        """Return the optimiser's state, the replay buffer and the age of the target network in gradient steps."""
+        """Return the optimiser's state, the replay buffer and the target network's age in gradient steps."""
         replay = self.replay.state_dict()
         for items in replay["_storage"]["_storage"].values():
             if isinstance(items, Tensor):  # unused places hold anything; equal agents have equal states

@@ -1,8 +1,7 @@
 """The base class of recurrent Q-learning agents: a cell, replayed sequences with stored states, double targets.
 
-Sequences are the rows of the batches as they were collected, with the stored state of the cell at their first step
-(Kapturowski et al. 2019, R2D2); the state is reset where ``is_init`` is set. One more step is kept after the last
-one, to bootstrap from.
+Sequences are the rows of collected batches, with the cell's stored state at their first step (Kapturowski et al. 2019,
+R2D2); it resets at ``is_init``. One more step is kept to bootstrap from.
 """
 
 from __future__ import annotations
@@ -47,14 +46,14 @@ class Quantiles(nn.Module):
 
 
 def of_action(quantiles: Tensor, action: Tensor) -> Tensor:
-    """Select the quantiles [B, L, K] of one action at every step, from [B, L, A, K] and [B, L]."""
+    """Select the quantiles [B, L, K] of each step's action from [B, L, A, K] and [B, L]."""
     index = action[..., None, None].expand(*action.shape, 1, quantiles.shape[-1])
     return quantiles.gather(-2, index).squeeze(-2)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecurrentQSettings(QLearnerSettings):
-    """The settings of `RecurrentQ`; batches are sequences of ``num_steps`` steps."""
+    """The settings of `RecurrentQ`, for sequences of ``num_steps`` steps."""
 
     cell: MakeCell = LSTM  # what remembers, a class of `baselines.cells` or a partial of one
 
@@ -65,10 +64,10 @@ class RecurrentQSettings(QLearnerSettings):
 
 
 class RecurrentQ(QLearner):
-    """Q-learning with a cell; classes that derive from it define the distance of predictions from targets.
+    """Q-learning with a cell; subclasses define the distance of predictions from targets.
 
     Args:
-        settings: the fields of the class's `Settings`.
+        settings: of the class's `Settings`.
     """
 
     Settings: ClassVar[Any] = RecurrentQSettings
@@ -103,7 +102,7 @@ class RecurrentQ(QLearner):
         return self._head(data)[0]
 
     def quantiles(self, data: Data) -> Tensor:
-        """Compute the network's quantiles, [B, L, A, K]."""
+        """Return the network's quantiles, [B, L, A, K]."""
         return self._head(data)[1]
 
     def _head(self, data: Data) -> tuple[Tensor, Tensor]:
@@ -119,10 +118,10 @@ class RecurrentQ(QLearner):
         return self.trunk.zero_state(num_envs)
 
     def experience(self, batch: TensorDictBase) -> TensorDictBase:
-        """Return a sequence of ``num_steps + 1`` steps per row; ``learnt`` is False where there is nothing to learn.
+        """Return a sequence of ``num_steps + 1`` steps per row.
 
-        That is at the step added for bootstrapping, at the padding of a shortened batch, and where an episode was
-        truncated, as the sequence does not hold what followed.
+        ``learnt`` is False at the step added for bootstrapping, at padding, and where an episode was truncated, as the
+        sequence does not hold what followed.
         """
         after = batch["next"]
         steps = batch.select("action", "gamma", "steps_to_next_obs", ("next", "reward"), ("next", "terminated"))
@@ -137,14 +136,14 @@ class RecurrentQ(QLearner):
         return torch.cat([batch.select(*keys), last], dim=1)
 
     def distance(self, predicted: Tensor, target: Tensor) -> Tensor:
-        """Compute the loss of every step, [B, L], from quantiles [B, L, K]."""
+        """Return the loss of every step, [B, L], from quantiles [B, L, K]."""
         raise NotImplementedError
 
     def loss(self, batch: Data, others: Data | None = None) -> TensorsByName:
-        """Compute the mean loss of the steps of sequences.
+        """Return the mean loss of the steps of sequences.
 
-        The target is the multi-step reward plus the target network's quantiles of the action that the online network
-        finds best at the step where the rewards end. Where ``learnt`` is False, it means nothing.
+        The target is the multi-step reward plus the target network's quantiles of the online network's best action
+        where the rewards end. It is unused where ``learnt`` is False.
         """
         online = self.quantiles(batch)
         with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Exact optimal transport between two weighted sets of points: NumPy has no solver, and SciPy is optional here."""
+"""Exact optimal transport between weighted sets of points, as NumPy has no solver and SciPy is optional."""
 
 from __future__ import annotations
 
@@ -13,18 +13,15 @@ Arcs = list[tuple[int, int]]
 
 
 def optimal_plan(cost: Floats, supply: Ints, demand: Ints) -> Ints:
-    """Compute a transport plan of least cost by successive shortest paths.
+    """Return a transport plan of least cost by successive shortest paths, int64 [rows, columns].
 
-    Units are whole numbers, so the plan has no rounding errors. Time grows with the number of columns most: it takes
-    about 10 ms for 50 rows and 25 columns, and 60 ms for 128 columns.
+    Units are whole numbers, without rounding errors. Time grows mostly with the columns: about 10 ms for 50 rows and 25
+    columns, 60 ms for 128 columns.
 
     Args:
         cost: of one unit from a row to a column, float64 [rows, columns].
         supply: units of each row, int64 [rows], at least 0.
         demand: units of each column, int64 [columns], at least 0.
-
-    Returns:
-        Units from each row to each column, int64 [rows, columns].
 
     Raises:
         ValueError: if the sums of supply and demand differ.
@@ -40,7 +37,7 @@ def optimal_plan(cost: Floats, supply: Ints, demand: Ints) -> Ints:
 
 
 class _Transport:
-    """A plan that grows along shortest paths, and the reduced costs, which are never negative and 0 where it sends.
+    """A plan that grows along shortest paths, and reduced costs, at least 0, and 0 where it sends.
 
     Args:
         cost: float64 [rows, columns].
@@ -55,7 +52,7 @@ class _Transport:
         self.columns = np.arange(cost.shape[1])
 
     def send(self, row: int, most: int) -> int:
-        """Send at most so many units from a row along the shortest path to a column that needs more; return how many.
+        """Send units from a row along the shortest path to a column that needs more; return how many.
 
         The path takes units away from arcs of the plan that it passes backwards.
         """
@@ -69,9 +66,9 @@ class _Transport:
         return units
 
     def _shortest_path(self, source: int) -> tuple[int, Arcs, Arcs]:
-        """Return the nearest column that needs more, and the arcs of the path to it, forward and backward.
+        """Return the nearest column that needs more, and the path's arcs, forward and backward.
 
-        The potentials change, so that the path has reduced costs of 0.
+        Potentials change so that the path has reduced costs of 0.
         """
         rows, columns = self.reduced.shape
         distance = self.reduced[source].copy()
