@@ -1,4 +1,4 @@
-"""``ctgraph-rl agents``: the agents, which tasks each can solve in principle, and what their memories can hold."""
+"""``ctgraph-rl agents``: the agents, the tasks that each can solve in principle, and what their memories can hold."""
 
 from __future__ import annotations
 

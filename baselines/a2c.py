@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from typing_extensions import override
+
 from baselines.parts.merge import mean
 from baselines.parts.networks import Data, TensorsByName
 from baselines.parts.policy_gradient import PolicyGradient, PolicyGradientSettings, critic_loss, entropy_loss
@@ -26,13 +28,13 @@ class A2CSettings(PolicyGradientSettings):
 
 
 class A2C(PolicyGradient):
-    """A2C for tasks that need no memory; its settings are `A2CSettings`."""
+    """A2C for tasks that need no memory."""
 
     Settings = A2CSettings
     solves = "fully observable tasks (CT-FO)"
 
+    @override
     def loss(self, batch: Data) -> TensorsByName:
-        """Compute the losses of policy, critic and entropy, as TorchRL's `A2CLoss` does."""
         frames, log_probs, taken, values = self.evaluate_actions(batch)
         return {
             "loss_objective": -mean(taken * frames["advantage"], frames),

@@ -5,8 +5,8 @@ Zintgraf et al. 2019, "Fast context adaptation via meta-learning" (arXiv 1810.03
     phi_i = phi_0 - alpha grad_phi L_i(theta, phi_0) with phi_0 = 0,    minimise over theta the mean of the outer losses
                                                                         of (theta, phi_i),
 
-with L_i on the first episodes of trial i and the outer loss on those that follow, see `baselines.parts.inner_loop`. phi
-is joined to the observation. Without context inputs it learns one policy for all tasks.
+with L_i on the first episodes of trial i and the outer loss on the others (`baselines.parts.inner_loop`). phi is joined
+to the observation. Without context inputs it learns one policy for all tasks.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class CAVIASettings(InnerLoopSettings):
 
 
 class CAVIA(InnerLoop):
-    """A policy of which a context adapts; its settings are `CAVIASettings`."""
+    """A policy of which a context adapts."""
 
     Settings = CAVIASettings
     solves = "tasks whose goal is drawn from several: it adapts a context after some episodes"

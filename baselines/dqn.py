@@ -28,8 +28,8 @@ from ctgraph_rl.checks import at_most, fraction, not_negative, require, true_or_
 class DQNSettings(QLearnerSettings):
     """The settings of `DQN`.
 
-    Where different states show the same image, a one-step target is the same after every decision, so nothing is
-    learned about decisions: ``n_steps`` helps.
+    Where states share an image, a one-step target is the same after every decision and teaches nothing about it:
+    ``n_steps`` helps.
     """
 
     double: bool  # let the online network choose the action of the target (double Q-learning)
@@ -47,7 +47,7 @@ class DQNSettings(QLearnerSettings):
 
 
 class DQN(QLearner):
-    """DQN for tasks that need no memory; its settings are `DQNSettings`."""
+    """DQN for tasks that need no memory."""
 
     Settings = DQNSettings
     stackable = True
@@ -79,14 +79,14 @@ class DQN(QLearner):
         return batch.select(*seen, "action", *after, "steps_to_next_obs").reshape(-1)
 
     def loss(self, batch: Data, others: Data | None = None) -> TensorsByName:
-        """Compute the loss of transitions, as TorchRL's ``DQNLoss`` does, and their squared errors, ``td_error``.
+        """Return the loss of transitions, as TorchRL's ``DQNLoss``, and their squared errors, ``td_error``.
 
-        The prediction is the value of the action taken; the target is the multi-step reward plus the discounted value
-        of the best action after it, by the target network.
+        The target is the multi-step reward plus the discounted value of the best action after it, by the target
+        network.
 
         Args:
             batch: transitions.
-            others: the target network's weights, in place of the present ones: see `other_weights`.
+            others: the target network's weights; None: those of `other_weights`.
         """
         after = {key: batch["next", key] for key in self.greedy.in_keys}
         predicted = self.values(batch).gather(-1, batch["action"].unsqueeze(-1)).squeeze(-1)

@@ -11,10 +11,10 @@ from baselines.parts.recurrent_q import RecurrentQ
 
 
 class DRQN(RecurrentQ):
-    """Deep recurrent Q-learning; the arguments are those of `RecurrentQ`."""
+    """Deep recurrent Q-learning; arguments as in `RecurrentQ`."""
 
     solves = "partially observable tasks too, if episodes are short enough to remember"
 
     def distance(self, predicted: Tensor, target: Tensor) -> Tensor:
-        """Compute the squared error of the value."""
+        """Return the squared error of the value."""
         return (predicted - target).square().squeeze(-1)

@@ -4,8 +4,8 @@ Finn et al. 2017, "Model-agnostic meta-learning for fast adaptation of deep netw
 
     theta_i = theta - alpha grad_theta L_i(theta),    minimise over theta the mean of the outer losses of theta_i,
 
-with L_i on the first episodes of trial i and the outer loss on those that follow, see `baselines.parts.inner_loop`. The
-outer gradient goes through the inner one: it has second derivatives of L_i.
+with L_i on the first episodes of trial i and the outer loss on the others (`baselines.parts.inner_loop`). The outer
+gradient has second derivatives of L_i.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class AllWeights(InnerModel):
 
 
 class MAML(InnerLoop):
-    """A policy of which all weights adapt; its settings are `InnerLoopSettings`."""
+    """A policy of which all weights adapt."""
 
     solves = "tasks whose goal is drawn from several: it adapts all weights after some episodes"
 

@@ -1,7 +1,7 @@
 """AMRL: an LSTM half of whose outputs are aggregated over the episode, by the maximum or the mean.
 
-Beck et al. 2020 (ICLR, Aggregated Memory for Reinforcement Learning): m_t = max(m_{t-1}, x_t) with m_0 = 0, or
-m_t = (x_1 + ... + x_t) / t; the other half y_t is handed on, and a layer reads both.
+Beck et al. 2020 (ICLR, Aggregated Memory for Reinforcement Learning): m_t = max(m_{t-1}, x_t) with m_0 = 0, or m_t =
+(x_1 + ... + x_t) / t; a layer reads m_t and the other half y_t.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ class AMRL(Cell):
     """Aggregated memory behind an LSTM.
 
     Args:
-        num_outputs: width of the LSTM and of what is written; even.
-        aggregator: ``max`` or ``mean``. The mean divides by the number of steps since the start, which nothing reads.
-        straight_through: the gradient of the aggregate by each input is 1, as in the paper, whose author later found
-            that it can explode (Beck et al. 2024, arXiv 2403.03020); False: that of the maximum or the mean.
+        num_outputs: width of the LSTM and the output; even.
+        aggregator: ``max`` or ``mean``, which divides by the steps since the start.
+        straight_through: the gradient of the aggregate by each input is 1, as in the paper, though it can explode (Beck
+            et al. 2024, arXiv 2403.03020); False: that of the maximum or the mean.
     """
 
     holds = "whether something was seen in an episode, for any time; and what its LSTM holds"
@@ -54,7 +54,7 @@ class AMRL(Cell):
         self.state_keys = (*LSTM.state_keys, *own)
 
     def zeros(self, num_rows: int) -> CellState:
-        """Return zeros: of the LSTM, and the maxima, [num_rows, num_outputs // 2], or sums and a count."""
+        """Return zeros of the LSTM, and the maxima, [num_rows, num_outputs // 2], or sums and a count."""
         aggregated = zeros_like_weights(self, num_rows, self.num_outputs // 2)
         zeros = (*self.inner.zeros(num_rows), aggregated)
         return zeros if self.is_max else (*zeros, zeros_like_weights(self, num_rows, 1))
@@ -95,7 +95,7 @@ class AMRL(Cell):
 
 
 def _sums(inputs: Tensor, starts: Tensor, state: Tensor) -> Tensor:
-    """Return the sums of [rows, steps, n] inputs since the start of the episode, and of a state before them."""
+    """Return sums of [rows, steps, n] inputs since the start of the episode, added to a state."""
     first = state.unsqueeze(1) + inputs[:, :1]
     carry = (~starts).unsqueeze(-1).to(inputs.dtype)
     return linear_scan(carry, torch.cat([first, inputs[:, 1:]], dim=1))

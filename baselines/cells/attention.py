@@ -1,8 +1,7 @@
 """Attention: a block of a causal transformer over the last steps of an episode.
 
-Vaswani et al. 2017 (arXiv 1706.03762), with normalised inputs of each part and a normalised output (Xiong et al. 2020,
-arXiv 2002.04745), and a learned bias for each head and distance in place of positions (Raffel et al. 2020, arXiv
-1910.10683):
+Vaswani et al. 2017 (arXiv 1706.03762), with normalised inputs and output (Xiong et al. 2020, arXiv 2002.04745), and a
+learned bias for each head and distance (Raffel et al. 2020, arXiv 1910.10683):
 
     x_t = W x'_t,  n_t = norm(x_t),  a_t = sum_s softmax_s(q(n_t) . k(n_s) / sqrt(n) + bias_{t-s}) v(n_s),
     y_t = x_t + W_o a_t,  output_t = norm(y_t + W_2 relu(W_1 norm(y_t))),
@@ -32,13 +31,13 @@ from ctgraph_rl.checks import at_least_one, require
 
 
 class Attention(Cell):
-    """A block of a causal transformer whose present step attends to the last steps of its episode.
+    """A block of a causal transformer over the last steps of an episode.
 
-    The state holds the inputs of these steps, each with a 1, and zeros for steps before the episode.
+    The state holds their inputs, each with a 1, and zeros for steps before the episode.
 
     Args:
-        num_outputs: width of what it writes; a multiple of ``num_heads``.
-        num_frames: steps that it attends to, the present one among them.
+        num_outputs: width of the output; a multiple of ``num_heads``.
+        num_frames: steps, including the present one.
         num_heads: heads of attention.
     """
 
@@ -66,11 +65,11 @@ class Attention(Cell):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Set the biases of distances to 0; the layers draw their own weights."""
+        """Set the biases of distances to 0."""
         nn.init.zeros_(self.bias)
 
     def zeros(self, num_rows: int) -> CellState:
-        """Return zeros in place of earlier inputs, [num_rows, num_frames - 1, num_inputs + 1], oldest first."""
+        """Return zeros for earlier inputs, [num_rows, num_frames - 1, num_inputs + 1], oldest first."""
         return (zeros_like_weights(self, num_rows, self.num_frames - 1, self.num_inputs + 1),)
 
     @override
@@ -93,11 +92,11 @@ class Attention(Cell):
         return self._block(frames, groups.shape[1], same)
 
     def _block(self, frames: Tensor, num_steps: int, same: Tensor) -> Tensor:
-        """Compute the outputs of the last steps, [rows, num_steps, num_outputs].
+        """Return the outputs of the last steps, [rows, num_steps, num_outputs].
 
         Args:
-            frames: the inputs of all steps, [rows, frames, num_inputs].
-            num_steps: how many steps have an output.
+            frames: inputs of all steps, [rows, frames, num_inputs].
+            num_steps: steps with an output.
             same: whether a frame is of a step's episode, bool [rows, num_steps, frames].
         """
         x = self.enter(frames)

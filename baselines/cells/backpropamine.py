@@ -1,8 +1,8 @@
 """Backpropamine: a recurrent layer whose weights change within an episode, as the network itself modulates.
 
 Miconi et al. 2019, "Backpropamine: training self-modifying neural networks with differentiable neuromodulated
-plasticity" (ICLR, arXiv 2002.10585). Beside slow weights W each connection has fast weights Hebb, which start at 0 with
-an episode, and a learned plasticity A:
+plasticity" (ICLR, arXiv 2002.10585). Each connection has slow weights W, fast weights Hebb, which an episode starts at
+0, and a learned plasticity A:
 
     h_t = tanh(W_i x_t + h_{t-1} (W + A * Hebb_{t-1})),  m_t = tanh(w_m h_t + b),  eta_t = m_t f + g, one of each unit,
 
@@ -11,12 +11,11 @@ an episode, and a learned plasticity A:
     none:         Hebb_t = clip(Hebb_{t-1} + eta h_{t-1} h_t^T, -2, 2), differentiable plasticity without modulation,
 
 where eta without an index is one learned number, and row i, column j of Hebb belongs to the connection from unit i to
-unit j. W and A start in [0, 0.001). The paper also feeds the last action, the last reward and the time; here the first
-two are settings, and no cell reads the time.
+unit j. W and A start in [0, 0.001). The paper also feeds the last action and reward, which are settings here, and the
+time.
 
-Fast weights are H^2 numbers an environment, 4 H^2 bytes, twice that if retroactive. A batch holds them once, before its
-first step: with 256 environments, 32 steps and H = 64, 4 MB in place of 134 MB. While a gradient is computed, there
-are as many for each step.
+Fast weights take 4 H^2 bytes an environment, twice that if retroactive. A batch holds them once, a gradient's
+computation for each step.
 """
 
 from __future__ import annotations
@@ -35,14 +34,11 @@ MODULATIONS = ("simple", "retroactive", "none")
 
 
 class Backpropamine(Cell):
-    """A recurrent layer with plastic weights.
+    """A recurrent layer with plastic weights; other arguments as in `Cell`.
 
     Args:
-        num_features: see `Cell`.
         num_outputs: number of units, H.
-        num_actions: see `Cell`.
         modulation: ``simple``, ``retroactive`` or ``none``.
-        reads: further arguments of `Cell`.
     """
 
     holds = "what its units did together within an episode, in as many numbers as it has connections"
@@ -67,7 +63,7 @@ class Backpropamine(Cell):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Draw W and A, and set the learned rate to 0.01; the linear layers draw their own."""
+        """Draw W and A, and set the learned rate to 0.01."""
         nn.init.uniform_(self.recurrent, 0, 0.001)
         nn.init.uniform_(self.plasticity, 0, 0.001)
         if self.modulation != "simple":
@@ -94,7 +90,7 @@ class Backpropamine(Cell):
         return PlasticSequence.apply(steps, given, *self._plastic(), *state)
 
     def _plastic(self) -> Plastic:
-        """Return the weights other than those of the inputs."""
+        """Return all weights but those of the inputs."""
         rate = None if self.modulation == "simple" else self.rate
         if self.modulation == "none":
             return Plastic(self.recurrent, self.plasticity, rate)

@@ -14,21 +14,21 @@ from ctgraph_rl.learn.collect import PREVIOUS_ACTION
 from ctgraph_rl.learn.histories import Tree
 
 CellState = tuple[Tensor, ...]
-"""The parts of a cell's state, [rows, ...] each, in the order of its ``state_keys``."""
+"""The parts of a state, [rows, ...] each, in the order of ``state_keys``."""
 
 CellOutput = tuple[Tensor, CellState]
-"""What a cell writes in a step, and its next state."""
+"""The output of a step, and the next state."""
 
 REWARD = "reward"
-"""The key of an agent's last reward."""
+"""Key of an agent's last reward."""
 
 
 class Cell(TakesNumbers, nn.Module):
-    """What an agent remembers with: it reads features, step after step, and writes what the heads read.
+    """What an agent remembers with: it reads features at each step and writes what the heads read.
 
-    A class that derives from it defines `state_keys`, `zeros` and `step`, and `sequence` where there is a faster way
-    than step by step. A parameter outside PyTorch's layers needs a ``reset_parameters``. A cell reads the
-    features of the observation and, if set, the agent's own last action and reward; never the time.
+    Subclasses define `state_keys`, `zeros` and `step`, and `sequence` where there is a faster way. A parameter outside
+    PyTorch's layers needs a ``reset_parameters``. A cell reads the observation's features and, if set, the last action
+    and reward, never the time.
 
     Args:
         num_features: width of the features.
@@ -39,11 +39,12 @@ class Cell(TakesNumbers, nn.Module):
     """
 
     state_keys: tuple[str, ...] = ()
-    """The keys of its state in the data. A key that begins with `ctgraph_rl.learn.collect.UNSTORED` is carried from
-    step to step, and batches hold its value at their first step only, which is all that `sequence` needs."""
+    """Keys of its state in the data. Of a key that begins with `ctgraph_rl.learn.collect.UNSTORED` batches hold the
+    value before their first step only, which is all that `sequence` needs.
+    """
 
     memory: ClassVar[bool] = True
-    """Whether it can hold anything of earlier steps."""
+    """Whether it holds anything of earlier steps."""
 
     holds: ClassVar[str]
     """What it can hold, in a few words."""
@@ -64,24 +65,21 @@ class Cell(TakesNumbers, nn.Module):
         self.num_actions = num_actions
 
     def zeros(self, num_rows: int) -> CellState:
-        """Return the state at the start of an episode, which is zero: of each key [num_rows, num_outputs] here."""
+        """Return the zero state at the start of an episode, here [num_rows, num_outputs] of each key."""
         return tuple(zeros_like_weights(self, num_rows, self.num_outputs) for _ in self.state_keys)
 
     def step(self, inputs: Tensor, state: CellState) -> CellOutput:
-        """Compute the outputs, [rows, num_outputs], and the next state from inputs, [rows, num_inputs], and a state."""
+        """Return the outputs, [rows, num_outputs], and the next state from inputs, [rows, num_inputs], and a state."""
         raise NotImplementedError
 
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
-        """Compute the outputs at all steps; the state is reset to zero before a step at which an episode starts.
+        """Return the outputs at all steps, [rows, steps, num_outputs]; the state is zero where an episode starts.
 
         Args:
             inputs: [num_groups, num_inputs], one for all frames that have the same.
             groups: the group of each frame, int64 [rows, steps].
             starts: where an episode starts, bool [rows, steps].
-            state: the state before the first step, already zero where an episode starts there.
-
-        Returns:
-            [rows, steps, num_outputs].
+            state: before the first step, already zero where an episode starts there.
         """
         outputs = []
         for group, start in zip(groups.unbind(1), starts.unbind(1), strict=True):
@@ -90,13 +88,13 @@ class Cell(TakesNumbers, nn.Module):
         return torch.stack(outputs, dim=1)
 
     def over_tree(self, tree: Tree, inputs: Tensor, groups: Tensor, state: CellState) -> Tensor:
-        """Compute the outputs at the ends of different histories, [num_histories, num_outputs].
+        """Return the outputs at the ends of different histories, [num_histories, num_outputs].
 
         Args:
             tree: the histories.
             inputs: [num_groups, num_inputs].
             groups: the group of each history's last inputs, int64 [num_histories].
-            state: what the histories of length 1 continue; see `Tree.initial`.
+            state: what the histories of length 1 continue, from `Tree.initial`.
         """
         outputs = []
         first = 0
@@ -120,7 +118,7 @@ def of_frames(values: Tensor, groups: Tensor) -> Tensor:
 
 
 def number_episodes(starts: Tensor) -> Tensor:
-    """Number the episodes of rows from 0, int64 [rows, steps], by where others than the first start."""
+    """Number the episodes of rows from 0, int64 [rows, steps], by starts after the first step."""
     return torch.cat([starts[:, :1] & False, starts[:, 1:]], dim=1).cumsum(dim=1)
 
 
@@ -130,10 +128,10 @@ def reset(state: Sequence[Tensor], starts: Tensor) -> CellState:
 
 
 def zeros_like_weights(cell: nn.Module, *shape: int) -> Tensor:
-    """Return zeros with the dtype and the device of a cell's weights."""
+    """Return zeros with dtype and device of a cell's weights."""
     return next(cell.parameters()).new_zeros(shape)
 
 
 def linear_layer(num_inputs: int, num_outputs: int) -> nn.Linear:
-    """Return a linear layer of float32 on the CPU, whatever torch's default dtype and device are."""
+    """Return a float32 linear layer on the CPU, whatever torch's defaults are."""
     return nn.Linear(num_inputs, num_outputs, dtype=torch.float32, device="cpu")

@@ -25,7 +25,7 @@ MOST_FRAMES = 1000
 
 
 def checked_frames(num_frames: int) -> int:
-    """Return a number of frames that a cell keeps.
+    """Return a valid number of frames.
 
     Raises:
         ValueError: for one frame, and more than `MOST_FRAMES`.
@@ -36,10 +36,10 @@ def checked_frames(num_frames: int) -> int:
 
 
 class Frames(Cell):
-    """A linear layer with ReLU over the inputs of the last steps; zeros stand for those before the episode.
+    """A linear layer with ReLU over the inputs of the last steps, zeros before the episode.
 
     Args:
-        num_frames: steps that it reads, the present one among them.
+        num_frames: steps that it reads, including the present one.
     """
 
     state_keys = ("recurrent_state_frames",)
@@ -51,7 +51,7 @@ class Frames(Cell):
         self.linear = linear_layer(num_frames * self.num_inputs, num_outputs)
 
     def zeros(self, num_rows: int) -> CellState:
-        """Return zeros in place of earlier inputs, [num_rows, num_frames - 1, num_inputs], oldest first."""
+        """Return zeros for earlier inputs, [num_rows, num_frames - 1, num_inputs], oldest first."""
         return (zeros_like_weights(self, num_rows, self.num_frames - 1, self.num_inputs),)
 
     @override

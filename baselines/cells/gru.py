@@ -19,7 +19,7 @@ from ctgraph_rl.learn.histories import Tree
 
 
 class GRU(Cell):
-    """A GRU of one layer; see `Cell` for the arguments."""
+    """A GRU of one layer; arguments as in `Cell`."""
 
     state_keys = ("recurrent_state_h",)
     holds = "what its gates let in"
@@ -39,7 +39,7 @@ class GRU(Cell):
 
     @override
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
-        """Each segment between two resets is a sequence, and the GRU runs over all of them at once."""
+        """The GRU runs over all segments between resets at once."""
         step = partial(gru_step, self.gru)
         return segments(starts).run(step, gru_inputs(self.gru, inputs), groups, state)
 
@@ -51,13 +51,13 @@ class GRU(Cell):
 
 
 def gru_inputs(gru: nn.GRU, features: Tensor) -> Tensor:
-    """Compute what features add to r, z and n of a GRU of one layer, [..., 3 * hidden_size]."""
+    """Return what features add to r, z and n of a one-layer GRU, [..., 3 * hidden_size]."""
     of_features, _, bias, _ = gru.all_weights[0]
     return nn.functional.linear(features, of_features, bias)
 
 
 def gru_step(gru: nn.GRU, given: Tensor, h: Tensor) -> CellState:
-    """Compute the next state, [rows, hidden_size], from `gru_inputs` and the present one."""
+    """Return the next state, [rows, hidden_size], from `gru_inputs` and the present one."""
     _, of_h, _, bias = gru.all_weights[0]
     carried = torch.addmm(bias, h, of_h.t())
     width = 2 * h.shape[1]

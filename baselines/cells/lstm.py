@@ -18,7 +18,7 @@ from ctgraph_rl.learn.histories import Tree
 
 
 class LSTM(Cell):
-    """An LSTM of one layer; see `Cell` for the arguments."""
+    """An LSTM of one layer; arguments as in `Cell`."""
 
     state_keys = ("recurrent_state_h", "recurrent_state_c")
     holds = "what its gates let in, and the number of times that something was seen"
@@ -39,7 +39,7 @@ class LSTM(Cell):
 
     @override
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
-        """Each segment between two resets is a sequence, and the LSTM runs over all of them at once."""
+        """The LSTM runs over all segments between resets at once."""
         if not starts[:, 1:].any():
             output, _ = self.lstm(of_frames(inputs, groups), _layer_first(state))
             return output
@@ -61,13 +61,13 @@ def _layer_first(state: CellState) -> CellState:
 
 
 def lstm_inputs(lstm: nn.LSTM, features: Tensor) -> Tensor:
-    """Compute what features add to the gates of an LSTM of one layer, [..., 4 * hidden_size]."""
+    """Return what features add to the gates of a one-layer LSTM, [..., 4 * hidden_size]."""
     of_features, _, bias, other_bias = lstm.all_weights[0]
     return nn.functional.linear(features, of_features, bias + other_bias)
 
 
 def lstm_step(lstm: nn.LSTM, given: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute the next hidden and cell states, [rows, hidden_size], from `lstm_inputs` and the present ones."""
+    """Return the next hidden and cell states, [rows, hidden_size], from `lstm_inputs` and the present ones."""
     of_h = lstm.all_weights[0][1]
     i, f, g, o = torch.addmm(given, h, of_h.t()).chunk(4, dim=1)
     c = torch.addcmul(f.sigmoid() * c, i.sigmoid(), g.tanh())

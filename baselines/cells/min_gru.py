@@ -14,7 +14,7 @@ from baselines.cells.scan import linear_scan
 
 
 class MinGRU(Cell):
-    """A minGRU of one layer; see `Cell` for the arguments."""
+    """A minGRU of one layer; arguments as in `Cell`."""
 
     state_keys = ("recurrent_state_h",)
     holds = "what its gate lets in, whatever it holds already"
@@ -41,6 +41,6 @@ class MinGRU(Cell):
         return linear_scan(carry * goes_on, torch.cat([first, given[:, 1:]], dim=1))
 
     def _parts(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what the state is multiplied by, and what is added to it."""
+        """Return the state's factor, and what is added to it."""
         gate = self.gate(inputs)
         return (-gate).sigmoid(), gate.sigmoid() * self.candidate(inputs)

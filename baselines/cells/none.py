@@ -1,4 +1,4 @@
-"""No memory: one more layer, for what an agent loses that cannot remember."""
+"""No memory: one more layer, to show what an agent loses."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from baselines.cells.cell import Cell, CellOutput, CellState, linear_layer, of_f
 
 
 class NoMemory(Cell):
-    """A linear layer with ReLU that reads only the present step; see `Cell` for the arguments."""
+    """A linear layer with ReLU of the present step; arguments as in `Cell`."""
 
     memory = False
     holds = "nothing"

@@ -1,6 +1,6 @@
 """An LSTM or a GRU over a tree of histories, with one backward pass for all steps.
 
-PyTorch's backward pass has every operation of every step. This one multiplies for all histories at once where it can.
+It multiplies for all histories at once where PyTorch's does each step's operations.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ Kept = tuple[Tensor, ...]
 
 
 class Gates(Protocol):
-    """A step of a cell without its products, and the gradients of that step."""
+    """A step of a cell without its products, and its gradients."""
 
     @staticmethod
     def step(given: Tensor, carried: Tensor, before: CellState) -> tuple[CellState, Kept]:
-        """Return the next state, and what is kept for `factors`.
+        """Return the next state, and what `factors` needs.
 
         Args:
             given: the product of the inputs, [n, G].
@@ -35,22 +35,22 @@ class Gates(Protocol):
 
     @staticmethod
     def factors(kept: Kept, before: CellState) -> Kept:
-        """Return what gradients are multiplied by, of any number of steps."""
+        """Return what gradients of any number of steps are multiplied by."""
         ...
 
     @staticmethod
     def back(factors: Kept, by: CellState) -> tuple[Tensor, Tensor, CellState]:
-        """Return gradients by ``given``, ``carried`` and the state, that through ``carried`` left out.
+        """Return gradients by ``given``, ``carried`` and the state, without that through ``carried``.
 
         Args:
             factors: of the steps.
-            by: the gradients by the parts of the next state.
+            by: gradients by the parts of the next state.
         """
         ...
 
 
 class LSTMGates(Gates):
-    """i, f, g and o of an LSTM; its state is h and c."""
+    """i, f, g and o of an LSTM with the state h and c."""
 
     @override
     @staticmethod
@@ -86,7 +86,7 @@ class LSTMGates(Gates):
 
 
 class GRUGates(Gates):
-    """r, z and n of a GRU; its state is h."""
+    """r, z and n of a GRU with the state h."""
 
     @override
     @staticmethod
@@ -115,21 +115,18 @@ class GRUGates(Gates):
 
 
 class GatedTree(NamedTuple):
-    """Histories, and the cell of `Gates` that goes over them."""
+    """Histories, and the cell of `Gates` over them."""
 
     gates: type[Gates]
 
     tree: Tree
 
     inputs: Tensor
-    """Which product the last input of each history has, int64 [num_histories]."""
+    """The product of each history's last input, int64 [num_histories]."""
 
 
 class GatesOverTree(torch.autograd.Function):
-    """The outputs of a cell of `Gates` at the ends of histories, [num_histories, H].
-
-    They are differentiable by products and weights, once.
-    """
+    """Outputs of a cell of `Gates` at the ends of histories, differentiable once by products and weights."""
 
     @staticmethod
     def forward(
@@ -140,15 +137,15 @@ class GatesOverTree(torch.autograd.Function):
         bias: Tensor | None,
         *initial: Tensor,
     ) -> Tensor:
-        """Compute the outputs.
+        """Return the outputs, [num_histories, H].
 
         Args:
             ctx: keeps what `backward` reads.
             gated: the histories.
-            given: the products of inputs, [n, G].
+            given: products of inputs, [n, G].
             weight: of the first part of the state, [G, H].
             bias: of that product, [G], or None.
-            initial: what the histories of length 1 continue, [n, H] each; it comes from data and has no gradient.
+            initial: what histories of length 1 continue, [n, H] each, without a gradient.
         """
         gates, tree, inputs = gated
         states = [torch.cat([part, part.new_empty(len(inputs), part.shape[1])]) for part in initial]

@@ -1,4 +1,4 @@
-"""Sequences between resets, packed step by step as PyTorch's recurrent layers read them."""
+"""Sequences between resets, packed as PyTorch's recurrent layers read them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Segments(NamedTuple):
     """The sequences between two resets in [rows, steps], longest first."""
 
     frames: Tensor
-    """The frames in packed order: all first steps, then all second ones; int64 [rows * steps], row by row."""
+    """The frames in packed order, all first steps, then all second ones; int64 [rows * steps], row by row."""
 
     sizes: Tensor
     """Number of sequences at each step, int64 [longest] on the CPU."""
@@ -29,13 +29,11 @@ class Segments(NamedTuple):
     def run(self, step: Callable[..., CellState], given: Tensor, groups: Tensor, state: Sequence[Tensor]) -> Tensor:
         """Run a recurrent layer over all sequences at once, with one product of features and weights for each group.
 
-        PyTorch's own backward pass writes a tensor of all frames at each step.
-
         Args:
             step: computes the next state from the products at a step and the parts of the present state.
             given: the product of each group, [num_groups, n].
             groups: the group of each frame, int64 [rows, steps].
-            state: of each row before its first step, [rows, n] for each part; a reset makes it 0.
+            state: before each row's first step, [rows, n] for each part; a reset makes it 0.
 
         Returns:
             The first part of the state after each frame, [rows, steps, n].

@@ -1,8 +1,7 @@
 """Sequences of a layer with plastic weights, whose gradient is written out.
 
-Autograd would keep some ten matrices a row for each step, and pass over them as often. Here a step keeps its state:
-one matrix a row, or two if modulation is retroactive. Equations and symbols are those of
-`baselines.cells.backpropamine`; a fast weight at its bound has gradient 0.
+A step keeps its state, one matrix a row, or two if modulation is retroactive, where autograd keeps some ten. Equations
+are those of `baselines.cells.backpropamine`; a fast weight at its bound has gradient 0.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import linear
+from typing_extensions import override
 
 from baselines.cells.cell import CellOutput, CellState
 
@@ -22,18 +22,19 @@ class PlasticSteps(NamedTuple):
     """How the steps of a sequence are taken."""
 
     step: Callable[[Tensor, CellState, Tensor], CellOutput]
-    """Computes the units and the next state from the inputs times their weights, [rows, H], and a state; the third
-    argument is overwritten, [rows, H, H]."""
+    """Returns units and next state from the inputs times their weights, [rows, H], a state, and [rows, H, H] to
+    overwrite.
+    """
 
     bound: float
     """Of fast weights."""
 
     resets: Sequence[Tensor]
-    """The rows whose state is reset before each step, int64 [n]; none before the first."""
+    """The rows reset before each step, int64 [n]; none before the first."""
 
 
 class Plastic(NamedTuple):
-    """The weights of a plastic layer, or their gradients; None where the modulation has none."""
+    """The weights of a plastic layer, or their gradients; None where modulation has none."""
 
     recurrent: Tensor
     """W, [H, H]."""
@@ -58,15 +59,15 @@ class Plastic(NamedTuple):
 
 
 class PlasticSequence(torch.autograd.Function):
-    """Take step after step, and compute the units, [rows, steps, H].
+    """Take step after step, and return the units, [rows, steps, H].
 
-    The arguments are how steps are taken, the inputs times their weights, [steps, rows, H], the tensors of `Plastic`,
-    and the units, the fast weights and, if retroactive, the trace before the first step.
+    Arguments are the steps, the inputs times their weights, [steps, rows, H], the tensors of `Plastic`, and the units,
+    fast weights and, if retroactive, trace before the first step.
     """
 
     @staticmethod
+    @override
     def forward(ctx: Any, steps: PlasticSteps, given: Tensor, *tensors: Tensor) -> Tensor:
-        """See `PlasticSequence`."""
         weights = tensors[: len(Plastic._fields)]
         state = tensors[len(Plastic._fields) :]
         ctx.save_for_backward(*weights)
@@ -114,9 +115,9 @@ class PlasticGradient:
         self._units = units
         self._slope = 1 - units.square()
         self.given = torch.empty_like(units)
-        """The gradient by the inputs times their weights, at the steps that were taken."""
+        """The gradient by the inputs times their weights."""
         self.state = [torch.zeros_like(value) for value in state]
-        """The gradient by the state before the last step that was taken."""
+        """The gradient by the state before the last step taken."""
         self._plasticity = torch.zeros_like(state[1])
         self._product = torch.empty_like(state[1])
         self._rate = units.new_zeros(())
@@ -134,9 +135,9 @@ class PlasticGradient:
 
         Args:
             t: the step.
-            by_units: the gradient by its units, but for what the next step adds, [rows, H].
+            by_units: the gradient by its units without the next step's share, [rows, H].
             state: before it.
-            after: the state after it, where the next step does not reset it.
+            after: after it, before any reset.
         """
         before, hebb, *_ = state
         by_hebb = self.state[1]
@@ -163,7 +164,7 @@ class PlasticGradient:
         return Plastic(recurrent, plasticity, None if self._weights.rate is None else self._rate, *modulator)
 
     def _through_change(self, t: int, by_units: Tensor, state: CellState) -> tuple[Tensor, Tensor]:
-        """Go back through the change of the fast weights; return the gradient by the units after and before it."""
+        """Go back through the change of fast weights; return the gradients by the units after and before it."""
         before = state[0]
         units = self._units[t]
         eta = self._eta[t]
@@ -189,10 +190,10 @@ class PlasticGradient:
 
 
 def columns_times(vectors: Tensor, matrices: Tensor) -> Tensor:
-    """Multiply a vector of each row, [rows, H], with its matrix, [rows, H, H]."""
+    """Multiply each row's vector, [rows, H], with its matrix, [rows, H, H]."""
     return torch.bmm(vectors.unsqueeze(1), matrices).squeeze(1)
 
 
 def rows_times(matrices: Tensor, vectors: Tensor) -> Tensor:
-    """Multiply the matrix of each row with its vector; several times as fast as with the vector as a column."""
+    """Multiply each row's matrix with its vector, faster than as a column."""
     return torch.bmm(vectors.unsqueeze(1), matrices.transpose(1, 2)).squeeze(1)

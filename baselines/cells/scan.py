@@ -1,7 +1,6 @@
-"""Scans over time with resets, in a number of operations that grows with the logarithm of the steps.
+"""Scans over time with resets, in a number of operations logarithmic in the steps.
 
-At each round a result takes in that of twice as many steps before (Hillis and Steele 1986), so there is no loop over
-time.
+Each round includes twice as many earlier steps (Hillis and Steele 1986), without a loop over time.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from torch import Tensor
 
 
 def linear_scan(carry: Tensor, inputs: Tensor) -> Tensor:
-    """Compute h_t = carry_t h_{t-1} + inputs_t over the steps, with h = 0 before the first.
+    """Return h_t = carry_t h_{t-1} + inputs_t at all steps, with h = 0 before the first.
 
     Args:
         carry: [rows, steps, n], or n = 1 for all; 0 is a reset.
@@ -27,11 +26,11 @@ def linear_scan(carry: Tensor, inputs: Tensor) -> Tensor:
 
 
 def max_scan(inputs: Tensor, starts: Tensor) -> Tensor:
-    """Compute the largest input since the last reset at each step.
+    """Return the largest input since the last reset at each step.
 
     Args:
         inputs: [rows, steps, n].
-        starts: where there is a reset, before the step, bool [rows, steps].
+        starts: where there is a reset before the step, bool [rows, steps].
     """
     goes_on = ~starts.unsqueeze(-1)
     for distance in _distances(inputs):
@@ -48,5 +47,4 @@ def _distances(inputs: Tensor) -> Iterator[int]:
 
 
 def _with_earlier(values: Tensor, later: Tensor) -> Tensor:
-    """Return values whose later steps are replaced."""
     return torch.cat([values[:, : values.shape[1] - later.shape[1]], later], dim=1)

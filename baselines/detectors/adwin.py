@@ -1,7 +1,7 @@
 """ADWIN on the return: a window of episodes is cut where the mean returns of its two parts differ.
 
-Bifet and Gavalda 2007 (SDM), "Learning from time-changing data with adaptive windowing"; the detector is that of the
-library River. We chose what counts as a suspicion, and when a label is accepted.
+Bifet and Gavalda 2007 (SDM), "Learning from time-changing data with adaptive windowing"; the detector is River's.
+Suspicion and acceptance of labels are our choices.
 """
 
 from __future__ import annotations
@@ -32,20 +32,19 @@ class Returns(NamedTuple):
 class ADWIN(Detector):
     """Suspects a change where ADWIN cuts its window of episode returns, and their mean has fallen.
 
-    A mean that has risen is that of learning. The label keeps number, mean and variance of the returns that were cut
-    off. A label on trial is accepted once at least ``num_trial_episodes`` returns have been seen, and their mean
-    differs from the kept one by at most ADWIN's own bound at the significance ``delta``. So a label without success is
-    accepted in any task without success. Every label starts with an empty window, and an episode that began before it
-    does not count: another label acted in it.
+    A mean that rises comes from learning. A label keeps number, mean and variance of the returns that were cut off. On
+    trial it is accepted once ``num_trial_episodes`` returns were seen and their mean differs from the kept one by at
+    most ADWIN's bound at significance ``delta``. So a label without success is accepted in any task without success.
+    Every label starts with an empty window and counts episodes that began with it.
 
     Args:
         delta: significance of a cut.
-        clock: episodes between two looks for a cut.
-        max_buckets: of each size, in which the window is kept.
+        clock: episodes between two tests for a cut.
+        max_buckets: of each size of the window.
         min_window_length: episodes of a part.
-        grace_period: episodes before the first look.
+        grace_period: episodes before the first test.
         num_trial_episodes: before a label is accepted.
-        settings: the arguments of `Detector`.
+        settings: arguments of `Detector`.
 
     Raises:
         ModuleNotFoundError: without River; names the extra to install.
@@ -89,7 +88,7 @@ class ADWIN(Detector):
         self.start_label(0, trial=False)
 
     def observe(self, seen: Seen) -> Verdict:
-        """Give ADWIN the returns of the episodes that ended, or on trial compare them with the kept ones."""
+        """Give ADWIN the returns of ended episodes, or on trial compare them with the kept ones."""
         ended = self._ended(seen)
         if self.is_trial:
             self.returns.extend(ended)
@@ -105,17 +104,17 @@ class ADWIN(Detector):
         """In the window, or of the trial."""
 
         self.is_whole: Tensor | None = None
-        """Whether the present episode of each row began with the label, bool [rows]; None: before the first batch."""
+        """Whether each row's present episode began with the label, bool [rows]; None: before the first batch."""
 
     def _ended(self, seen: Seen) -> list[float]:
-        """Return the returns of the episodes that ended, of those that began with the label, row after row."""
+        """Return the returns of ended episodes that began with the label, row after row."""
         before = torch.zeros(len(seen.done), dtype=torch.bool, device="cpu") if self.is_whole is None else self.is_whole
         is_whole = before.unsqueeze(1) | (seen.is_init.cumsum(dim=1) > 0)
         self.is_whole = is_whole[:, -1].clone()
         return seen.episode_return[seen.done & is_whole].tolist()
 
     def _falls(self, episode_return: float) -> bool:
-        """Add a return to the window; return whether it was cut and its mean has fallen, and then keep the rest."""
+        """Add a return; if the window was cut and its mean has fallen, keep the rest and return True."""
         self.window.update(episode_return)
         self.returns.append(episode_return)
         if not self.window.drift_detected:
@@ -129,7 +128,7 @@ class ADWIN(Detector):
         return after.mean < before.mean
 
     def _accepted(self) -> Verdict:
-        """Return the label on trial if its returns are those that were kept."""
+        """Return the label on trial if its returns match the kept ones."""
         kept = self.kept.get(self.label)
         seen = returns_of(self.returns)
         if kept is None or seen.number < self.num_trial_episodes:
@@ -137,14 +136,14 @@ class ADWIN(Detector):
         return self.label if abs(seen.mean - kept.mean) <= bound(kept, seen, self.delta) else None
 
     def state_dict(self) -> NamedValues:
-        """Return what verdicts depend on; 8 bytes for each return in the window, 1 for each row."""
+        """Return what verdicts depend on: 8 bytes for each return in the window, 1 for each row."""
         kept = {label: tuple(each) for label, each in self.kept.items()}
         returns = torch.tensor(self.returns, dtype=torch.float64, device="cpu")
         now = {"label": self.label, "is_trial": self.is_trial, "is_whole": self.is_whole}
         return {**now, "returns": returns, "kept": kept}
 
+    @override
     def load_state_dict(self, state: ReadOnlyValues) -> None:
-        """Restore what `state_dict` returned; the window is made again of its returns."""
         self.start_label(state["label"], state["is_trial"])
         self.kept = {label: Returns(*each) for label, each in state["kept"].items()}
         self.returns = state["returns"].tolist()
@@ -154,12 +153,12 @@ class ADWIN(Detector):
 
 
 def returns_of(values: Sequence[float]) -> Returns:
-    """Return number, mean and variance of some returns; zeros if there are none."""
+    """Return number, mean and variance of returns; zeros if there are none."""
     return Returns(len(values), fmean(values), pvariance(values)) if values else Returns(0, 0.0, 0.0)
 
 
 def bound(first: Returns, second: Returns, delta: float) -> float:
-    """Compute ADWIN's bound of the difference of two means, Bifet and Gavalda 2007, Section 3.3.
+    """Return ADWIN's bound of the difference of two means, Bifet and Gavalda 2007, Section 3.3.
 
     epsilon = sqrt(2 v L / m) + 2 L / (3 m), with L = ln(2 ln(n) / delta), n episodes in all, 1 / m = 1 / n0 + 1 / n1,
     and v the variance of all returns.
@@ -173,7 +172,6 @@ def bound(first: Returns, second: Returns, delta: float) -> float:
 
 
 def _river_adwin() -> Any:
-    """Return River's detector."""
     try:
         from river.drift import ADWIN as RiverADWIN
     except ModuleNotFoundError as error:

@@ -1,8 +1,8 @@
 """AMD: a predictive model for each label, and a chi-squared test of what it predicts.
 
-Dick et al. 2020, Frontiers in Neurorobotics 14, 578675, here after the equations, without their code. The model is a
-table of frequencies in place of their predictive state representation or network; windows do not overlap, two
-batches decide, a new model is not tested during its first steps, and steps without a cluster are one: our choices.
+Dick et al. 2020, Frontiers in Neurorobotics 14, 578675, after the equations, without their code. Our choices: a table
+of frequencies as model, windows that do not overlap, two batches that decide, an untested start of a new model, and one
+cluster of unclustered steps.
 """
 
 from __future__ import annotations
@@ -34,34 +34,33 @@ DEGREES = ("published", "corrected")
 
 IMPOSSIBLE = 1e-8
 PENALTY = 10.0
-"""Where less than the first is expected, PENALTY * O^2 is added in place of (O - E)^2 / E."""
+"""Where E is tiny, PENALTY * O^2 is added in place of (O - E)^2 / E."""
 
 
 class AMD(Detector):
     """Compares what is observed after each action with what the model of each label expects.
 
-    The model of a label gives P(o | a), the probability of each observation after each action, from the last ``order``
-    actions and observations of the episode: relative frequencies of the steps that were acted with the label, with
-    ``smoothing`` added to each count. The tables P of ``window`` steps are clustered by DBSCAN. With O the number of
-    steps in which o followed a in a cluster, and E the sum over the cluster's steps with a of its mean P(o | a),
+    The model of a label gives P(o | a), the probability of each observation after each action, given the last ``order``
+    actions and observations of the episode: relative frequencies in the label's steps, with ``smoothing`` added to each
+    count. The tables P of ``window`` steps are clustered by DBSCAN. With O the number of steps in which o followed a in
+    a cluster, and E the sum over the cluster's steps with a of its mean P(o | a),
 
         X = sum (O - E)^2 / E,   p = P(chi^2 with k degrees of freedom > X)
 
     with k = n m (``published``), which accepts too often, or n (m - 1) (``corrected``), where n is the number of pairs
     of a cluster and an action in it, and m that of observations. The p-value of a batch is the smallest one of its W
     windows, times W. A label fits if that is at least ``threshold``. Where the present label does not fit, the next
-    batch decides, as the steps of this one may be of two tasks: the label of the largest p-value is next, or a new one
-    if none fits.
+    batch decides, as this one may mix two tasks: the label of the largest p-value is next, or a new one if none fits.
 
     Args:
         window: steps of a test.
-        order: steps of the episode on which a prediction depends.
+        order: steps on which a prediction depends.
         smoothing: added to each count.
-        radius: two tables with at most this Euclidean distance are neighbours.
-        min_neighbours: of a table and itself that make it the core of a cluster.
-        threshold: a label with a smaller p-value does not fit.
+        radius: largest Euclidean distance of neighbours.
+        min_neighbours: of the core of a cluster, itself included.
+        threshold: least p-value of a label that fits.
         degrees: of freedom: published or corrected.
-        keeps_fitting: the present label stays as long as it fits; False: the label with the largest p-value is next.
+        keeps_fitting: the present label stays while it fits; False: the largest p-value decides.
         num_untested: steps of a new label before it is tested.
         max_labels: most labels.
     """
@@ -120,13 +119,13 @@ class AMD(Detector):
         """Of each label."""
 
         self.recent = integers(num_rows, self.order - 1)
-        """The last pairs of action and next observation of each row's episode, from 1; 0 stands for none."""
+        """The last pairs of action and next observation of each row's episode, from 1; 0: none."""
 
         self.last_action = integers(num_rows)
         """Of each row."""
 
         self.pending = integers(0, 3)
-        """History, action and next observation of the steps behind the last window."""
+        """History, action and next observation of the steps after the last window."""
 
     def observe(self, seen: Seen) -> Verdict:
         """Test every full window; learn from the batch if the label stays."""
@@ -146,14 +145,14 @@ class AMD(Detector):
         return None
 
     def start_label(self, label: int, trial: bool) -> None:
-        """Begin a model where the label is new, and forget the steps that are in no window yet."""
+        """Begin a model if the label is new, and forget the steps outside windows."""
         self.label = label
         self.is_doubted = False
         self.pending = self.pending[:0]
         self.models.setdefault(label, Counts())
 
     def triples(self, seen: Seen) -> Tensor:
-        """Return number of the history, action and next observation of each step, row after row, int64 [N, 3]."""
+        """Return history, action and next observation of each step, row after row, int64 [N, 3]."""
         action = seen.action
         before = torch.cat([self.last_action.unsqueeze(1), action[:, :-1]], dim=1)
         pairs = torch.where(seen.is_init, 0, before) * self.num_observations + cast(Tensor, seen.observation_id) + 1
@@ -174,7 +173,7 @@ class AMD(Detector):
         self.models[self.label].add(history * self.num_outcomes + action * self.num_observations + following)
 
     def _predicted(self, label: int, history: Tensor) -> Tensor:
-        """Return P(o | a) after histories by the model of a label, float64 [..., actions, observations]."""
+        """Return a label's P(o | a) after histories, float64 [..., actions, observations]."""
         outcomes = history.unsqueeze(-1) * self.num_outcomes + torch.arange(self.num_outcomes, device="cpu")
         counts = self.models[label].of(outcomes).double() + self.smoothing
         counts = counts.unflatten(-1, (self.num_actions, self.num_observations))
@@ -188,7 +187,7 @@ class AMD(Detector):
         return self._label_for([min(1.0, len(windows) * p_value) for p_value in smallest])
 
     def _label_for(self, p_values: list[float]) -> int:
-        """Return the label that fits, by the p-values of all."""
+        """Return the label that fits by all p-values."""
         present = p_values[self.label]
         best = max(p_values)
         if present == best or (self.keeps_fitting and present >= self.threshold):
@@ -200,7 +199,7 @@ class AMD(Detector):
         return len(self.models) == self.max_labels
 
     def p_values(self, label: int, windows: Tensor) -> Tensor:
-        """Return the p-value of a label in each window of steps, int64 [W, window, 3]: float64 [W]."""
+        """Return a label's p-value in each window of steps, int64 [W, window, 3]: float64 [W]."""
         history, action, following = windows.unbind(-1)
         predicted = self._predicted(label, history)
         found = clusters(predicted.flatten(2), self.radius, self.min_neighbours)
@@ -225,7 +224,7 @@ class AMD(Detector):
 
 
 class Counts:
-    """How often each of many numbers occurred; those that never did take no memory.
+    """Counts of numbers; those that never occurred take no memory.
 
     Args:
         keys: the numbers in rising order, int64 [n]; None: none.
@@ -257,7 +256,7 @@ class Counts:
 
 
 def statistic(observed: Tensor, expected: Tensor) -> Tensor:
-    """Compute the sum of (O - E)^2 / E over all but the first dimension; 10 O^2 where E is below 1e-8."""
+    """Return the sum of (O - E)^2 / E over all but the first dimension; 10 O^2 where E is below 1e-8."""
     terms = torch.where(expected < IMPOSSIBLE, PENALTY * observed**2, (observed - expected) ** 2 / expected)
     return terms.flatten(1).sum(dim=1)
 
@@ -268,10 +267,10 @@ def chi_squared_tail(statistics: Tensor, degrees: Tensor) -> Tensor:
 
 
 def clusters(points: Tensor, radius: float, min_neighbours: int) -> Tensor:
-    """Cluster points by DBSCAN: cores within the radius of each other, and those within the radius of a core.
+    """Cluster points by DBSCAN: cores within the radius of each other, and points within the radius of a core.
 
-    A core has at least ``min_neighbours`` points within the radius, itself among them. A point near cores of several
-    clusters is in the one whose first core comes first.
+    A core has at least ``min_neighbours`` points within the radius, itself included. A point near several clusters
+    joins the one whose first core comes first.
 
     Args:
         points: float [..., N, n].
@@ -279,7 +278,7 @@ def clusters(points: Tensor, radius: float, min_neighbours: int) -> Tensor:
         min_neighbours: of a core.
 
     Returns:
-        int64 [..., N]: the place of the first core of a point's cluster, -1 without a cluster.
+        int64 [..., N]: the place of the first core of a point's cluster, or -1.
     """
     number = points.shape[-2]
     near = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist") <= radius

@@ -8,8 +8,8 @@ from ctgraph_rl.agent import MethodLike
 
 
 class Detector(Judge):
-    """Labels the tasks of a method; a class that derives from it defines `observe`. Arguments are those of `Judge`."""
+    """Labels the tasks of a method; subclasses define `observe`. Arguments as in `Judge`."""
 
     def labelling(self, method: MethodLike) -> SelfLabelled:
-        """Return a method that labels tasks by this detector; see `ctgraph_rl.agent.DetectorLike`."""
+        """Return a method that labels tasks by this detector, as `ctgraph_rl.agent.DetectorLike`."""
         return SelfLabelled(method, self)

@@ -1,4 +1,4 @@
-"""What judges whether the task has changed: all of a detector but the method that it labels."""
+"""Judges whether the task has changed: a detector without the method that it labels."""
 
 from __future__ import annotations
 
@@ -10,34 +10,33 @@ from ctgraph_rl.checks import NamedValues, ReadOnlyValues, TakesNumbers, at_leas
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 MOST_LABELS = 2**20
-"""The largest number of labels, equal to that of task ids; memory grows with each."""
+"""Most labels, as of task ids; memory grows with each."""
 
 
 class Judge(TakesNumbers):
     """Judges from what the learner sees whether the task is still that of the present label.
 
-    Labels are 0, 1, 2, ... in the order in which they are opened. `SelfLabelled` calls `observe` once with each batch,
-    before the batch is learned from, and tells by `start_label` with which label it acts next. Nothing is drawn from
-    torch's global generator.
+    Labels count from 0 in the order of opening. `SelfLabelled` calls `observe` with each batch before it is learned
+    from, and `start_label` with the label that acts next. Nothing is drawn from torch's global generator.
 
     Args:
-        max_labels: most labels; None, where a detector allows it: one for each task of the curriculum.
+        max_labels: most labels; None, where allowed: one for each task of the curriculum.
         patience: frames for which a known label is tried before the next one.
-        snapshot_every: frames between two snapshots of what is learned; a suspicion restores the older of two. None:
-            there are none, and a suspicion restores nothing.
+        snapshot_every: frames between snapshots of what is learned; a suspicion restores the older of two. None: no
+            snapshots.
     """
 
     reads: ClassVar[str] = ""
     """What its verdicts depend on, in a few words."""
 
     needs: ClassVar[tuple[str, ...]] = ()
-    """What it reads of `Seen` beside the fields that are always there: ``features``, ``observation_id``."""
+    """Optional fields of `Seen` that it reads: ``features``, ``observation_id``."""
 
     is_oracle: ClassVar[bool] = False
     """Whether it is given the curriculum."""
 
     changing: ClassVar[tuple[str, ...]] = ()
-    """The attributes that its verdicts depend on, tensors and plain values."""
+    """Attributes that its verdicts depend on, tensors and plain values."""
 
     def __init__(self, max_labels: int | None, patience: int, snapshot_every: int | None) -> None:
         labels = is_int(max_labels, 1) or (max_labels is None and self.is_oracle)
@@ -59,9 +58,9 @@ class Judge(TakesNumbers):
 
         Args:
             num_rows: rows of a batch.
-            num_steps: steps of a batch, unless the end of a block has shortened it.
+            num_steps: steps of a batch; blocks may end with a shorter one.
             num_actions: number of different actions.
-            num_observations: number of different observations where they are one-hot; None for images.
+            num_observations: number of one-hot observations; None for images.
 
         Raises:
             ValueError: if it cannot work with them.
@@ -75,18 +74,18 @@ class Judge(TakesNumbers):
         """Return what a batch says of the present label.
 
         Returns:
-            None: nothing; the label stays. `SUSPICION`: what is learned is rolled back, learning pauses, and the known
-            labels are tried. A label: this one from the next batch on, without a rollback; while labels are tried it is
-            accepted. The number of labels so far stands for a new one.
+            None: the label stays. `SUSPICION`: learning is rolled back and pauses, and the known labels are tried. A
+                label: this one from the next batch on, without a rollback; in a trial it is accepted. The number of
+                labels so far is a new one.
         """
         raise NotImplementedError
 
     def start_label(self, label: int, trial: bool) -> None:
-        """Called when the next batch will be the first one that is acted with a label.
+        """Called when the next batch will be the first of a label.
 
         Args:
             label: the label.
-            trial: whether it is tried after a suspicion; False where learning begins, or resumes, with it.
+            trial: whether it is tried after a suspicion; False where learning begins or resumes with it.
         """
 
     def state_dict(self) -> NamedValues:

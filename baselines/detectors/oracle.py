@@ -1,4 +1,4 @@
-"""The oracle: labels are the true tasks, the upper reference of all detectors."""
+"""The oracle: labels are the true tasks, the upper reference of detectors."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 
 
 class Oracle(Detector):
-    """Knows the curriculum and counts frames: a label is the position of the task in ``curriculum.tasks``.
+    """Knows the curriculum and counts frames: a label is the task's position in ``curriculum.tasks``.
 
     Where boundaries are announced, a label starts with its block: this is ``protocol.task_id=at_boundaries``, bit for
-    bit. Where they are hidden, it starts with the first batch that begins in the block; each row ends its episode of
-    the task before first, as always there.
+    bit. Where they are hidden, it starts with the first batch that begins in the block, while rows first end their old
+    episodes.
 
     Args:
         max_labels: most labels; None: one for each task.
@@ -33,11 +33,11 @@ class Oracle(Detector):
         self.curriculum = curriculum
 
     def present_label(self) -> int:
-        """Return the label of the task of the next frame; after the last one, that of the last task."""
+        """Return the label of the next frame's task; after the end, that of the last one."""
         block = min(self.curriculum.block_at(self.frames + 1), len(self.curriculum.blocks))
         return self.curriculum.trained[block - 1][0]
 
     def observe(self, seen: Seen) -> Verdict:
-        """Return the label of the task in which the next batch begins; nothing where boundaries are announced."""
+        """Return the label of the task in which the next batch begins; None where boundaries are announced."""
         self.frames += seen.action.numel()
         return None if self.curriculum.protocol.announces else self.present_label()

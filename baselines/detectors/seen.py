@@ -9,9 +9,9 @@ from torch import Tensor
 
 
 class Seen(NamedTuple):
-    """A batch as a detector gets it, on the CPU: what the learner itself sees, and nothing of the task.
+    """A batch as a detector gets it, on the CPU: what the learner sees, and nothing of the task.
 
-    A detector reads the steps of the first row in time order, then those of the second row, and so on.
+    Steps are read row after row, in time order.
     """
 
     action: Tensor  # int64 [rows, steps]
@@ -31,7 +31,7 @@ class Suspicion(Enum):
 
 
 SUSPICION = Suspicion.CHANGE
-"""The answer that the task has changed, to which one is not known yet."""
+"""The answer that the task has changed to an unknown one."""
 
 Verdict = int | Literal[Suspicion.CHANGE] | None
 """A label, `SUSPICION`, or None where nothing speaks against the present label."""

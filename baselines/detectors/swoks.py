@@ -1,7 +1,7 @@
 """SWOKS: sliced Wasserstein distances from the past, and a test whether they have grown.
 
-Dick et al. 2024 (CoLLAs), arXiv 2405.19047, here after the equations, without their code. We chose the
-use of samples of a trial, what is kept of a label to which the learner returns, and how often a sample has to be new.
+Dick et al. 2024 (CoLLAs), arXiv 2405.19047, after the equations, without their code. Our choices: the use of a trial's
+samples, what a label keeps, and how often a sample is new.
 """
 
 from __future__ import annotations
@@ -21,36 +21,36 @@ from baselines.parts.embedding import sliced_distances, unit_directions
 from ctgraph_rl.checks import at_least_one, fraction, is_int, positive, require
 
 WINDOWS_BEFORE = 3
-"""Windows of a label before the first distance is measured."""
+"""A label's windows before its first distance."""
 
 
 class SWOKS(Detector):
     """Suspects a change where the newest steps are further from the label's earlier ones than they were.
 
-    A step is the point u = (action, sqrt(F) reward, features [F]). After every ``window`` points the sliced
-    2-Wasserstein distance of these from a reference is measured for each label: for the present one the reference is
-    the oldest of its last ``num_windows`` + 1 windows, for the others the one that they had when they were left. Once
-    more than ``stable_phase`` points have passed since the label was started, the last ``num_tested`` distances are
-    compared with the earlier ones, times ``adjustment``: a one-sided Kolmogorov-Smirnov test. A p-value below ``alpha``
-    is a suspicion. The label then keeps its reference, and its distances but the last ``num_left_out``.
+    A step is the point u = (action, sqrt(F) reward, features [F]). After every ``window`` points their sliced
+    2-Wasserstein distance from each label's reference is measured. The present label's reference is the oldest of its
+    last ``num_windows`` + 1 windows, the others' is the one that they left with. After ``stable_phase`` points of a
+    label, a one-sided Kolmogorov-Smirnov test compares the last ``num_tested`` distances with the earlier ones, times
+    ``adjustment``. A p-value below ``alpha`` is a suspicion. The label then keeps its reference, and its distances but
+    the last ``num_left_out``.
 
     A label on trial is accepted as soon as the same test of its distances has a p-value above ``accept``. Points of a
-    trial are in no reference. The label that is accepted starts with an empty history.
+    trial enter no reference. An accepted label starts with an empty history.
 
     Args:
         window: points between two tests (L_D).
         num_windows: windows of the history after the oldest one (L_W).
         num_directions: of the sliced distance.
         num_tested: newest distances that are tested.
-        num_kept: distances that are kept, with those.
-        num_left_out: newest distances that are not part of what a label keeps when it is left.
+        num_kept: distances that are kept, including those.
+        num_left_out: newest distances that a label does not keep.
         alpha: a p-value below is a suspicion.
         accept: a p-value above accepts a label on trial.
         adjustment: by which earlier distances are multiplied.
         stable_phase: points after the start of a label without a test.
-        num_fresh: distances that are measured in a trial before its first test; with fewer than ``num_tested``, a label
-            may be accepted for steps that were taken before its trial.
-        settings: the arguments of `Detector`.
+        num_fresh: distances in a trial before its first test; with fewer than ``num_tested``, steps before the trial
+            count.
+        settings: arguments of `Detector`.
     """
 
     reads = "features, rewards"
@@ -112,16 +112,16 @@ class SWOKS(Detector):
         """The points behind the last window."""
 
         self.history: list[Tensor] = []
-        """The last windows of the present label, oldest first, float32 [window, n] each; none in a trial."""
+        """The present label's last windows, oldest first, float32 [window, n] each; none in a trial."""
 
         self.references: dict[int, Tensor] = {}
         """Of labels that were left, float32 [window, n]."""
 
         self.earlier: dict[int, list[float]] = {}
-        """Distances with which those of a label that was left are compared."""
+        """Distances with which those of a left label are compared."""
 
         self.distances: dict[int, list[float]] = {0: []}
-        """The newest distances from the reference of each label, oldest first."""
+        """The newest distances from each label's reference, oldest first."""
 
     @override
     def observe(self, seen: Seen) -> Verdict:
@@ -136,7 +136,7 @@ class SWOKS(Detector):
         return None
 
     def start_label(self, label: int, trial: bool) -> None:
-        """Forget the points that are in no window yet, and the history."""
+        """Forget the history, and the points outside windows."""
         self.label = label
         self.is_trial = trial
         self.num_points = 0
@@ -147,7 +147,7 @@ class SWOKS(Detector):
             self.distances[label] = []
 
     def _update(self, window: Tensor) -> Verdict:
-        """Measure the distances of a window, and test those of the label."""
+        """Measure a window's distances, and test those of the label."""
         self.num_points += len(window)
         if not self.is_trial:
             self.history = [*self.history, window.clone()][-self.num_windows - 1 :]
@@ -155,7 +155,7 @@ class SWOKS(Detector):
         return self._accepted() if self.is_trial else self._suspicion()
 
     def _measure(self, window: Tensor) -> None:
-        """Measure the distance of a window from the reference of each label that has one."""
+        """Measure a window's distance from each reference."""
         references = dict(self.references)
         if len(self.history) > WINDOWS_BEFORE:
             references[self.label] = self.history[0]
@@ -174,7 +174,7 @@ class SWOKS(Detector):
         return self.label if enough and self._p_value(earlier, newest) > self.accept else None
 
     def _suspicion(self) -> Verdict:
-        """Return a suspicion if the distances of the present label have grown; it then keeps what it is known by."""
+        """Return a suspicion if the present label's distances have grown, after storing what the label keeps."""
         distances = self.distances[self.label]
         if self.num_points <= self.stable_phase or len(distances) <= self.num_left_out:
             return None
@@ -189,7 +189,7 @@ class SWOKS(Detector):
 
 
 def points_of(seen: Seen) -> Tensor:
-    """Return the steps of a batch as points, row after row: action, sqrt(F) reward, features; float32 [N, 2 + F]."""
+    """Return a batch's steps as points, row after row: action, sqrt(F) reward, features; float32 [N, 2 + F]."""
     features = cast(Tensor, seen.features).flatten(0, 1)
     reward = math.sqrt(features.shape[1]) * seen.reward.flatten()
     return torch.cat([seen.action.flatten().unsqueeze(1), reward.unsqueeze(1), features], dim=1).float()

@@ -1,4 +1,4 @@
-"""A one-sided two-sample Kolmogorov-Smirnov test with exact p-values: SciPy, which has one, is optional here."""
+"""A one-sided two-sample Kolmogorov-Smirnov test with exact p-values, as SciPy is optional here."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 MOST_VALUES = 1000
-"""Of both samples together; with more the number of ways to mix them overflows a float64."""
+"""Of both samples together; with more, float64 overflows."""
 
 
 def ks_greater(first: ArrayLike, second: ArrayLike) -> float:
-    """Return the p-value of the hypothesis that the values of two samples have the same distribution.
+    """Return the exact p-value of the hypothesis that two samples of real numbers have the same distribution.
 
-    It is small where the second sample has larger values: the statistic is the largest F(x) - G(x), with the empirical
-    distribution functions F and G of the samples. It is exact for continuous distributions, and the same as
-    ``scipy.stats.ks_2samp(first, second, alternative="greater", method="exact")``.
+    It is small where the second sample is larger: the statistic is the largest F(x) - G(x) of the empirical
+    distribution functions. The same as ``scipy.stats.ks_2samp(first, second, alternative="greater", method="exact")``
+    for continuous distributions.
 
     Args:
-        first: real numbers [m], at least one.
-        second: real numbers [n], at least one; m + n is at most `MOST_VALUES`.
+        first: [m], at least one.
+        second: [n], at least one; m + n is at most `MOST_VALUES`.
     """
     x = np.sort(np.asarray(first, dtype=np.float64))
     y = np.sort(np.asarray(second, dtype=np.float64))
@@ -37,8 +37,8 @@ def ks_greater(first: ArrayLike, second: ArrayLike) -> float:
 def _exact(m: int, n: int, most: int) -> float:
     """Return the probability that F - G reaches most / (m n).
 
-    The order of all values is a path from (0, 0) to (m, n), and all paths are equally likely. ``after[i]`` counts the
-    paths from (i, j) on that reach i n - j m >= most, for j from n down to 0.
+    The order of all values is a path from (0, 0) to (m, n); all paths are equally likely. ``after[i]`` counts paths
+    from (i, j) that reach i n - j m >= most, for j from n down to 0.
     """
     after: NDArray[Any] = np.zeros(m + 1)
     for j in range(n, -1, -1):

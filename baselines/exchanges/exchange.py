@@ -18,7 +18,7 @@ from ctgraph_rl.learn.messages import Message
 
 
 class Exchange(TakesNumbers):
-    """An exchange without messages, from which others derive: no member learns from another.
+    """An exchange without messages, the base of others.
 
     Args:
         num_members: learners of the collective.
@@ -39,7 +39,7 @@ class Exchange(TakesNumbers):
         self.kinds: Sequence[str] = ()
 
     def settings_of(self, member: int) -> ReadOnlyValues:
-        """Return none; see `ctgraph_rl.learn.collective.ExchangeLike`, as for all methods."""
+        """Return none; methods as in `ctgraph_rl.learn.collective.ExchangeLike`."""
         return {}
 
     def connect(self, agents: Sequence[Agent]) -> None:
@@ -67,17 +67,17 @@ class Exchange(TakesNumbers):
 class MaskExchange(Exchange):
     """An exchange of masks, which knows each member's last mean return in each of its tasks.
 
-    All members have the same network behind their masks, so a mask of one is a mask of all.
+    All members have the same network behind their masks.
     """
 
     method = "mask_ri"
-    """Name of the method that members need."""
+    """The method that members need."""
 
     def connect(self, agents: Sequence[Agent]) -> None:
         """Take the members' methods.
 
         Raises:
-            ValueError: if a member has no masks that this exchange knows, or another network than the first member.
+            ValueError: if a member has other masks or another network than this exchange needs.
         """
         self.methods: list[Any] = [getattr(agent, "method", None) for agent in agents]
         name = type(self).__name__
@@ -95,11 +95,11 @@ class MaskExchange(Exchange):
         self.returns: list[dict[int, float]] = [{} for _ in agents]
 
     def takes(self, method: Masks) -> bool:
-        """Return whether it can exchange the masks of a method."""
+        """Return whether it can exchange a method's masks."""
         return True
 
     def task_of(self, member: int) -> int:
-        """Return the id of the task that a member learns."""
+        """Return the id of a member's present task."""
         method = self.methods[member]
         return method.started[method.slot]
 
@@ -109,7 +109,7 @@ class MaskExchange(Exchange):
             self.returns[member][self.task_of(member)] = episode_return
 
     def return_of(self, member: int, task: int) -> float:
-        """Return a member's last mean return in a task; 0 where it has none."""
+        """Return a member's last mean return in a task, or 0."""
         return self.returns[member].get(task, 0.0)
 
     @override

@@ -1,4 +1,4 @@
-"""L2D2-C: learners ask each other for masks of the task that they learn, and take over the best one.
+"""L2D2-C: learners ask each other for masks of their task, and take over the best one.
 
 Nath et al. 2023 (CoLLAs), repository DMIU-ShELL/L2D2-C. We chose to query first after the first batch.
 """
@@ -17,22 +17,22 @@ from ctgraph_rl.learn.collective import Help
 from ctgraph_rl.learn.messages import Message, to_all
 
 SHARE = 0.9
-"""A peer's mask is wanted if this share of its return is more than one's own."""
+"""A peer's mask is wanted if this share of its return exceeds one's return."""
 
 DIGITS = 6
-"""Digits behind the point with which returns are compared."""
+"""Decimals to which returns are compared."""
 
 
 class L2D2C(MaskExchange):
-    """Each member asks all others for masks of its present task, by the task's id, and overwrites its own scores.
+    """Each member asks all others for masks of its present task, by id, and overwrites its scores with the best.
 
-    A query holds the id and the member's last mean return r, 0 where it has none. A peer offers its mask if its own
-    last return r' in the task is positive and 0.9 r' > r. The member requests the mask with the highest r', of equal
-    ones that of the first peer, and replaces its scores. The optimiser keeps its state.
+    A query holds the id and the member's last mean return r, or 0. A peer offers its mask if its last return r' in the
+    task is positive and 0.9 r' > r. The member takes the mask with the highest r', of the first peer if equal. The
+    optimiser keeps its state.
     """
 
     def takes(self, method: Masks) -> bool:
-        """Return whether the mask of a task uses only the scores of that task."""
+        """Return whether a task's mask uses only its scores."""
         return not isinstance(method, MaskLC)
 
     @override
@@ -72,11 +72,10 @@ class L2D2C(MaskExchange):
         return helps
 
     def _about(self, member: int, task: int) -> dict[str, object]:
-        """Return what a member says of a task."""
         return {"task": task, "reward": self.return_of(member, task)}
 
     def _best(self, member: int, received: Sequence[Message]) -> list[Message]:
-        """Return the message of the highest return, of those that still concern the task; none if there is none."""
+        """Return the message of the highest return that still concerns the task, if any."""
         task = self.task_of(member)
         own = self.return_of(member, task)
         wanted = []

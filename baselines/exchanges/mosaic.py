@@ -1,4 +1,4 @@
-"""MOSAIC: learners find out by embeddings who learns a similar task, and combine masks of those who do better.
+"""MOSAIC: learners find similar tasks by embeddings, and combine masks of those who do better.
 
 Nath et al. 2025 (arXiv 2506.05577), repository DMIU-ShELL/MOSAIC, where each member has one task. Its detection of task
 changes is not here: a new task begins without an embedding. We chose to query first after the first batch.
@@ -36,27 +36,27 @@ from ctgraph_rl.learn.collective import Help
 from ctgraph_rl.learn.messages import Message, to_all
 
 LARGEST_RETURN = 0.9999
-"""Of a return that decides the own share: others keep a share that can be learned."""
+"""Of a return that decides the own share, so that the others keep one."""
 
 
 class Mosaic(MaskExchange):
     """Each member sends its task's embedding to all others, and combines masks of similar ones with a higher return.
 
     After each batch a member's z becomes (z + e) / 2, at first e / 2, where e is the linear Wasserstein embedding of
-    ``num_samples`` of the last ``buffer_size`` transitions, with its last mean return r. A peer offers its mask if the
-    cosine of both z is at least ``threshold`` and its own return is above r. The member requests the ``top_n`` most
-    similar ones. Its own scores become its present combination, with an initial share of 0.5 + 0.5 r, r clipped to
-    [0, 0.9999], or ``own_share``; the c received share the rest equally (`MaskShared.receive`).
+    ``num_samples`` of the last ``buffer_size`` transitions. Its last mean return is r. A peer offers its mask if the
+    cosine of both z is at least ``threshold`` and its return is above r. The member requests the ``top_n`` most similar
+    ones. Its own scores become its present combination, with an initial share of 0.5 + 0.5 r, r clipped to [0, 0.9999],
+    or ``own_share``; the c received share the rest equally (`MaskShared.receive`).
 
     Args:
         threshold: least cosine, in [-1, 1].
-        top_n: masks that are requested at most.
+        top_n: most masks that are requested.
         num_samples: N. **More than** ``buffer_size`` **means that no embedding is ever made and no message sent**, as
             with the 256 of the published default.
         buffer_size: the last transitions that samples are drawn from.
         num_references: reference points of the embedding.
-        use_similarity: False offers masks whatever the task is.
-        use_return: False offers masks whatever the returns are.
+        use_similarity: False ignores the tasks.
+        use_return: False ignores the returns.
         own_share: fixed initial share of the own scores, in (0, 1); None: by the return.
         seed: decides the samples.
         common: arguments of `Exchange`.
@@ -168,7 +168,7 @@ class Mosaic(MaskExchange):
         return helps
 
     def _offers(self, member: int, query: Message) -> list[Message]:
-        """Return an offer to who asked, if the tasks are similar and the member's return is higher."""
+        """Return an offer if the tasks are similar and the member's return is higher."""
         embedding = self.known[member].embedding
         own = self._own_return(member)
         if embedding is None or (self.use_return and own <= query.content["reward"]):
@@ -183,7 +183,7 @@ class Mosaic(MaskExchange):
         return self.return_of(member, self.task_of(member))
 
     def _best(self, member: int, received: Sequence[Message]) -> list[Message]:
-        """Return the most similar ones, one of each sender, of those that still concern the member's task."""
+        """Return the most similar messages, one of each sender, that still concern the member's task."""
         task = self.task_of(member)
         newest = {each.sender: each for each in received if each.content["task"] == task}
         return sorted(newest.values(), key=lambda each: (-each.content["similarity"], each.sender))[: self.top_n]

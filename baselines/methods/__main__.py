@@ -1,4 +1,4 @@
-"""``ctgraph-rl methods``: the methods, what each needs to know, and the detectors that find it out."""
+"""``ctgraph-rl methods``: the methods, what each needs to know, and the detectors that find it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from baselines.parts.catalogue import CatalogueEntry, catalogue, config_dir_of
 
 
 def needs_ids(method: CatalogueEntry) -> str:
-    """Return when a method needs task ids: ``yes``, ``no``, with which setting, or ``-`` of one of yours."""
+    """Return when a method needs task ids: ``yes``, ``no``, with which setting, or ``-`` of yours."""
     needs = method.says("needs_task_id")
     return "heads=multi" if needs == "no" and "heads" in method.settings else needs
 

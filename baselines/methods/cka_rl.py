@@ -1,4 +1,4 @@
-"""CKA-RL: each task's weights are those of the first task, its own vector, and a mixture of earlier vectors.
+"""CKA-RL: each task's weights are the first task's, a vector of the task, and a mixture of earlier vectors.
 
 Hu et al. 2025 (Continual Knowledge Adaptation for Reinforcement Learning, NeurIPS, arXiv 2510.19314).
 """
@@ -24,12 +24,11 @@ class CKARL(TaskMethod):
     """w = w_base + v_k + sum_j softmax(scale * alpha)_j v_j, for some or all of the network's weights.
 
     w_base are the weights at the end of the first task, which is learned without a method. In each later task v_k
-    starts at 0 and is trained together with alpha; at the task's end v_k joins the pool of vectors v_j. If the pool is
-    full, the mean of the two vectors with the highest cosine replaces them. The twin of Mask LC without masks: that
-    combines the scores of masks in the same way.
+    starts at 0 and is trained together with alpha; at the end it joins the pool of vectors v_j. If the pool is full,
+    the mean of the two vectors with the highest cosine replaces them. Mask LC combines masks' scores in the same way.
 
-    All other weights are shared by all tasks and trained on. An earlier task is played with its own weights w where it
-    has them, and the present ones elsewhere. A task that returns continues to train its w, without a mixture.
+    All other weights are shared. An earlier task is played with its w and the present other weights. A task that
+    returns trains its w further, without a mixture.
 
     Stored are w_base, the pool and v_k, 4 S bytes each, and w of each of the curriculum's tasks, 4 S bytes, where S is
     the number of weights in ``scope``.
@@ -87,7 +86,7 @@ class CKARL(TaskMethod):
 
     @property
     def trainable(self) -> list[nn.Parameter]:
-        """The optimiser's parameters: the weights, those in scope by w_base + v_k, and alpha."""
+        """The optimiser's parameters: the weights, with w_base + v_k in scope, and alpha."""
         own = iter(self.own)
         weights = zip(self.weights.parameters, self.inside, strict=True)
         return [*(next(own) if inside else parameter for parameter, inside in weights), self.alpha]
@@ -103,7 +102,7 @@ class CKARL(TaskMethod):
         return (self.factor * self.alpha[: self.num_combined]).softmax(dim=0)
 
     def current(self) -> Tensor:
-        """Compute w in scope, float32 [S]."""
+        """Return w in scope, float32 [S]."""
         own = flat(list(self.own))
         return own + self.shares @ self.pool[: self.num_combined] if self.num_combined else own
 
@@ -151,15 +150,15 @@ class CKARL(TaskMethod):
 
     @torch.no_grad()
     def task_weights(self, task: int) -> Tensor | None:
-        """Return the weights of a task in scope, and the present ones elsewhere."""
+        """Return a task's weights in scope, and the present ones elsewhere."""
         return self.present_with(task, self.in_scope, self.kept)
 
     def _within(self, tensors: Sequence[Tensor]) -> list[Tensor]:
-        """Return those in scope of the network's weights, or of their gradients."""
+        """Return the weights, or gradients, in scope."""
         return [each for each, inside in zip(tensors, self.inside, strict=True) if inside]
 
     def _add(self, vector: Tensor) -> None:
-        """Add a vector to the pool; if that is full, the mean of the two most similar vectors replaces them."""
+        """Add a vector to the pool; if full, the mean of the two most similar ones replaces them."""
         vectors = torch.cat([self.pool[: self.num_pooled], vector.unsqueeze(0)])
         if len(vectors) > self.pool_size:
             vectors = merged(vectors)

@@ -23,12 +23,12 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 
 
 class Reservoir:
-    """A uniform random sample of all items that were ever offered.
+    """A uniform random sample of all items that were offered.
 
-    Vitter 1985, Algorithm R: item number n takes a random one of n places, if the reservoir has that place.
+    Vitter 1985, Algorithm R: item n takes a random one of n places, if the reservoir has it.
 
     Args:
-        capacity: the largest number of items.
+        capacity: most items.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -40,7 +40,7 @@ class Reservoir:
         return min(self.offered, self.capacity)
 
     def offer(self, items: Mapping[Any, Tensor]) -> None:
-        """Put items, [n, ...] each, at the random places that the reservoir has; later ones replace earlier ones."""
+        """Put items, [n, ...] each, at random places that the reservoir has; later ones replace earlier ones."""
         if not self.items:
             self.items = {key: value.new_zeros(self.capacity, *value.shape[1:]) for key, value in items.items()}
         number = next(iter(items.values())).shape[0]
@@ -67,15 +67,14 @@ class CLEAR(Method):
     """Adds cloning losses for earlier behaviour, on as many replayed steps as a minibatch has new ones.
 
     L = policy_coeff KL(mu || pi) + value_coeff |V_mu - V|^2, where mu and V_mu are the network's outputs when the step
-    was taken; for a Q-learner value_coeff |Q_mu - Q|^2, the mean over actions. The agent's own losses are on its own
-    data: the paper's off-policy policy gradient (V-trace) on replayed steps is left out. It needs no task ids and no
-    boundaries.
+    was taken; for a Q-learner value_coeff |Q_mu - Q|^2, the mean over actions. The paper's off-policy policy gradient
+    (V-trace) on replayed steps is left out. It needs no task ids and no boundaries.
 
-    Stored are ``buffer_size`` steps, each with the network's inputs and outputs, whatever the number of tasks; with
-    memory whole rows of a batch, without those that the end of a block has shortened.
+    Stored are ``buffer_size`` steps with the network's inputs and outputs, whatever the number of tasks; with memory
+    whole rows of full batches.
 
     Args:
-        buffer_size: number of steps that are stored.
+        buffer_size: stored steps.
         policy_coeff: weight of the policy's cloning loss.
         value_coeff: weight of the values' cloning loss.
     """
@@ -107,7 +106,7 @@ class CLEAR(Method):
 
     @torch.no_grad()
     def on_batch(self, batch: TensorDictBase) -> None:
-        """Offer the steps, or with memory the rows, of a batch to the reservoir."""
+        """Offer a batch's steps, or with memory its rows, to the reservoir."""
         agent = self.agent
         if agent.memory and batch.shape[1] != agent.num_steps:
             return
@@ -122,7 +121,7 @@ class CLEAR(Method):
         self.reservoir.offer(items)
 
     def transform_minibatch(self, batch: Data) -> Data:
-        """Add as many replayed items to the minibatch, if there are any yet."""
+        """Add as many replayed items to the minibatch, once there are any."""
         if not len(self.reservoir):
             return batch
         replayed = self.reservoir.sample(len(batch["action"]))

@@ -23,10 +23,9 @@ from ctgraph_rl.checks import fraction, one_of, require, true_or_false
 class EWC(SampledImportance):
     """Adds lambda/2 * sum_i F_i (w_i - a_i)^2 for earlier tasks; F is the diagonal of the Fisher information.
 
-    Separate: one such term for each earlier task k, with its own F_k and weights a_k. As a sum of squares is a square,
-    they are kept exactly as one: F = sum_k F_k, a = sum_k F_k a_k / F. Online: F is the running mean
-    alpha F + (1 - alpha) F_k, which begins at 0, and a are the weights at the end of the last task; Schwarz et al. have
-    the sum gamma F + F_k.
+    Separate: a term for each earlier task k, with F_k and weights a_k. Their sum is exactly one term: F = sum_k F_k, a
+    = sum_k F_k a_k / F. Online: F is the running mean alpha F + (1 - alpha) F_k, which begins at 0, and a are the
+    weights at the end of the last task; Schwarz et al. have the sum gamma F + F_k.
 
     Args:
         coeff: lambda.
@@ -56,7 +55,7 @@ class EWC(SampledImportance):
         return self.mean(self._of_policy) if self.fisher == "policy" else self._of_losses()
 
     def consolidate(self, new: Tensor, weights: Tensor) -> None:
-        """Update the running mean, or add the task's term to those of earlier tasks."""
+        """Update the running mean, or add the task's term."""
         if not self.online:
             total = self.importance + new
             moved = torch.where(total > 0, (self.importance * self.anchor + new * weights) / total, weights)
@@ -84,6 +83,6 @@ class EWC(SampledImportance):
 def add_squared_gradients(
     agent: Learner, minibatch: Data, weights: Sequence[Tensor], squares: Tensor, num_items: int
 ) -> None:
-    """Add to ``squares``, [P], those of the gradients of an agent's losses on a minibatch, over its number of items."""
+    """Add to ``squares``, [P], the squared gradients of an agent's losses on a minibatch, over its number of items."""
     gradients = torch.autograd.grad(total_loss(agent.loss(minibatch)), weights, materialize_grads=True)
     squares += flat(gradients).square() / num_items

@@ -17,11 +17,11 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 
 
 class Finetune(Method):
-    """The agent learns one task after the other. With a trained trunk nothing is stored, and any agent will do.
+    """The agent learns one task after the other; nothing is stored while the trunk is trained.
 
     Args:
-        trunk: "trained", or "kept": after the first task only the output layers learn, and the weights of that moment
-            are stored. This measures whether features of the first block serve later tasks.
+        trunk: "trained", or "kept": after the first task, whose weights are stored, only the output layers learn. This
+            measures whether features of the first block serve later tasks.
 
     Raises:
         ValueError: for another trunk.

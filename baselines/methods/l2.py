@@ -7,23 +7,21 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from baselines.methods.parts.importance import Importance
 
 
 class L2(Importance):
-    """Adds coeff * |w - a|^2; a are the weights at the end of the last task.
-
-    The arguments are those of `Importance`.
-    """
+    """Adds coeff * |w - a|^2; a are the weights at the end of the last task."""
 
     stackable = True
 
+    @override
     def task_importance(self) -> Tensor:
-        """Return 1 for all weights."""
         return torch.ones_like(self.importance)
 
     def consolidate(self, new: Tensor, weights: Tensor) -> None:
-        """Keep all weights equally important after any number of tasks."""
+        """Keep all weights equally important."""
         self.importance.copy_(new)
         self.anchor.copy_(weights)

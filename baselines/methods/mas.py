@@ -17,15 +17,15 @@ from baselines.parts.networks import Data
 class MAS(SampledImportance):
     """Adds coeff * sum_i O_i (w_i - a_i)^2, O_i = sum over tasks of the mean |d |f(s)|^2 / d w_i| over samples.
 
-    f are all of the network's outputs: log-probabilities and value, or action values; a are the weights at the end of
-    the last task. The arguments are those of `SampledImportance`.
+    f are the network's outputs: log-probabilities and value, or action values; a are the weights at the end of the last
+    task.
     """
 
     stackable = True
     agent_members = (*SampledImportance.agent_members, "outputs", "output_keys")
 
     def task_importance(self) -> Tensor:
-        """Return the mean sensitivity of the squared norm of the outputs."""
+        """Return the mean sensitivity of the outputs' squared norm."""
         return self.mean(self._sensitivity)
 
     def _sensitivity(self, item: Data) -> Iterator[Tensor]:

@@ -1,7 +1,7 @@
-"""AMSC: modulating masks that combine the tasks that stand out by their similarity, by a sparsemax.
+"""AMSC: modulating masks that combine the most similar tasks, by a sparsemax.
 
-It follows the public repository DMIU-ShELL/AMSC at commit 075e23e of 2026-07-02, described from facts about it: its
-code was not used. There is no paper with a public text, and the repository changes.
+After facts about the public repository DMIU-ShELL/AMSC at commit 075e23e of 2026-07-02, without its code. There is no
+paper with a public text.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ DISTANCES = ("cosine", "l2")
 EPISODES = ("training", "evaluation", "none")
 
 SMALLEST_DEVIATION = 1e-3
-"""Similarities are divided by no less."""
+"""Least divisor of similarities."""
 
 
 class MaskAMSC(SelectedMasks):
     """`SelectedMasks` with the support of a sparsemax: w = sparsemax(t / temperature), selected are those with w > 0.
 
-    t are the similarities to all earlier tasks, standardised over them, without those of tasks whose competence is 0.
-    A task's competence is its mean training return in its last batches, or as in AMSC the mean return of an evaluation
-    right after the task: that is an oracle's, as a learner has no episodes that do not count. With two earlier tasks
-    exactly one is selected, and so is an only one, however dissimilar.
+    t are the similarities to all earlier tasks, standardised over them, without those of tasks whose competence is 0. A
+    task's competence is its mean training return in its last batches, or as in AMSC the mean return of an evaluation
+    after the task: an oracle's, as a learner has no episodes that do not count. Of one or two earlier tasks exactly one
+    is selected.
 
     Args:
         distance: ``cosine`` of the embeddings is the similarity, or minus their Euclidean distance, ``l2``.
         z_score: standardise similarities over the earlier tasks.
         temperature: of the sparsemax.
-        competence: ``training`` or ``evaluation``, the episodes that it is of; ``none`` leaves out no task.
-        competence_batches: batches that a training return is the mean of.
+        competence: of ``training`` or ``evaluation`` episodes; ``none`` leaves out no task.
+        competence_batches: batches of a mean training return.
         shuffled: select as many tasks at random instead, by its own random stream.
-        settings: the arguments of `SelectedMasks`.
+        settings: arguments of `SelectedMasks`.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class MaskAMSC(SelectedMasks):
         """Of the tasks that have ended, by slot."""
 
         self.returns: deque[tuple[float, int]] = deque(maxlen=competence_batches)
-        """Sums of the returns of the episodes that ended in the last batches, and their numbers."""
+        """Summed returns and numbers of the episodes that ended in the last batches."""
 
     @override
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
@@ -100,13 +100,13 @@ class MaskAMSC(SelectedMasks):
         self.competence[self.slot] = min(max(found, 0.0), 1.0)
 
     def _trained(self) -> float:
-        """Return the mean return of the episodes that ended in the last batches; 0 if none did."""
+        """Return the mean return of the episodes that ended in the last batches, or 0."""
         total = sum(returns for returns, _ in self.returns)
         number = sum(count for _, count in self.returns)
         return total / max(number, 1)
 
     def _evaluated(self) -> float:
-        """Return the mean return of an evaluation as the curriculum has them."""
+        """Return the mean return of the curriculum's evaluation."""
         how = self.curriculum.evaluation
         agent = self.agent
         played = evaluate(
@@ -141,7 +141,7 @@ class MaskAMSC(SelectedMasks):
         return support.tolist()
 
     def get_extra_state(self) -> NamedValues:
-        """Return competences, returns and the state of the stream that shuffles."""
+        """Return competences, returns and the state of the shuffling stream."""
         own = {"competence": dict(self.competence), "returns": list(self.returns), "shuffle": self.shuffle.get_state()}
         return {**super().get_extra_state(), **own}
 
@@ -155,17 +155,17 @@ class MaskAMSC(SelectedMasks):
 
 
 def similarities(embedding: Tensor, others: Tensor, distance: str) -> Tensor:
-    """Return how similar an embedding of norm 1, [Z], is to others, [n, Z]: [n]."""
+    """Return the similarities of an embedding of norm 1, [Z], to others, [n, Z]: [n]."""
     return others @ embedding if distance == "cosine" else -(others - embedding).norm(dim=1)
 
 
 def standardised(values: Tensor) -> Tensor:
-    """Return values minus their mean, divided by their standard deviation or `SMALLEST_DEVIATION`, [n]."""
+    """Return values minus their mean, by their standard deviation or `SMALLEST_DEVIATION`, [n]."""
     return (values - values.mean()) / values.std(correction=0).clamp(min=SMALLEST_DEVIATION)
 
 
 def sparsemax(values: Tensor) -> Tensor:
-    """Return the probabilities that are nearest to values, [n], most of which are 0.
+    """Return the probabilities nearest to values, [n], most of which are 0.
 
     Martins and Astudillo 2016 (arXiv 1602.02068): w = max(z - tau, 0), tau = (sum of the K largest - 1) / K, with the
     largest K that has 1 + K z_(K) > sum of the K largest.

@@ -13,7 +13,7 @@ from baselines.methods.mask_lc import MaskLC
 
 
 class MaskBLC(MaskLC):
-    """`MaskLC` with an initial share of 0.5 for the new scores, and equal ones for the earlier tasks."""
+    """`MaskLC` with an initial share of 0.5 for the new scores, and equal ones for earlier tasks."""
 
     @override
     def initial_betas(self, num_earlier: int) -> Tensor:

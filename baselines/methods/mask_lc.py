@@ -1,4 +1,4 @@
-"""Mask LC: modulating masks, each task's is a linear combination of the earlier ones and a new one.
+"""Mask LC: modulating masks, each a linear combination of the earlier ones and a new one.
 
 Ben-Iwhiwhu et al. 2023 (TMLR, arXiv 2212.11110), their Mask_LC.
 """
@@ -39,11 +39,11 @@ class MaskLC(Masks):
 
     @property
     def num_combined(self) -> int:
-        """Number of earlier tasks in the present combination."""
+        """Number of earlier tasks in the combination."""
         return self.ended if self.slot >= self.ended else 0
 
     def initial_betas(self, num_earlier: int) -> Tensor:
-        """Return the initial b of the earlier tasks, followed by that of the new scores: equal shares of 1 / k."""
+        """Return the initial b of the earlier tasks, then of the new scores: equal shares of 1 / k."""
         return torch.zeros(num_earlier + 1, dtype=torch.float32, device="cpu")
 
     @override

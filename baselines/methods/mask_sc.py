@@ -1,7 +1,7 @@
-"""MaskSC: modulating masks that combine the tasks that are most similar, or that an oracle names.
+"""MaskSC: modulating masks that combine the most similar tasks, or those that an oracle names.
 
-Described from facts about the public repository DMIU-ShELL/MaskSC (2026), which has no paper with a public text. Its
-code was not used.
+After facts about the public repository DMIU-ShELL/MaskSC (2026), without its code. There is no paper with a public
+text.
 """
 
 from __future__ import annotations
@@ -22,24 +22,23 @@ from ctgraph_rl.tasks.task import Task, ct_graphs
 SELECTIONS = ("similarity", "random", "none", "all", "parent", "depth_prefix")
 
 ORACLES = ("all", "parent", "depth_prefix")
-"""Selected from a task's start; the last two are read from the curriculum, which a learner does not know."""
+"""Selected from a task's start; the last two read the curriculum, which a learner does not know."""
 
 
 class MaskSC(SelectedMasks):
     """`SelectedMasks` with the most similar tasks: a cosine of embeddings above a threshold, and the highest of those.
 
-    Other selections are references. ``all`` is Mask LC and ``none`` is Mask RI, bit by bit; ``random`` are ``top_k``
-    earlier tasks, drawn again at each selection. Two are an oracle's, who knows images and goals: ``depth_prefix`` are
-    all earlier tasks with the same images whose goal is the beginning of this one's, ``parent`` is the last of them.
+    Other selections are references. ``all`` is Mask LC and ``none`` is Mask RI, bit by bit; ``random`` draws ``top_k``
+    earlier tasks at each selection. An oracle knows images and goals: ``depth_prefix`` are all earlier tasks with the
+    same images whose goal is the beginning of this one's, ``parent`` is the last of them.
 
-    Not known, and decided here: the embedding is the moving average of AMSC, and the first selection is after ``every``
-    batches.
+    Our choices: the embedding is AMSC's moving average, and the first selection is after ``every`` batches.
 
     Args:
         selection: one of `SELECTIONS`.
         threshold: the cosine must be larger, in [-1, 1].
         top_k: most tasks that are selected.
-        settings: the arguments of `SelectedMasks`.
+        settings: arguments of `SelectedMasks`.
     """
 
     def __init__(self, selection: str, threshold: float, top_k: int, **settings: Any) -> None:
@@ -97,12 +96,12 @@ class MaskSC(SelectedMasks):
 
 
 def is_prefix(one: Task, other: Task) -> bool:
-    """Return whether a task has the images of another, as many as it needs, and a goal on the way to the other's."""
+    """Return whether a task has another's images, as many as it needs, and a goal on the way to the other's."""
     alike = _without_number(one.images) == _without_number(other.images)
     return alike and one.goal == other.goal[: len(one.goal)] and len(one.goal) < len(other.goal)
 
 
 def _without_number(images: Any) -> Any:
-    """Return images with the number of them set to 1, where it is theirs to say."""
+    """Return images with their own number, if any, set to 1."""
     number = getattr(images, "__dataclass_fields__", {}).get("num_images")
     return replace(images, num_images=1) if number is not None and number.init else images

@@ -24,8 +24,8 @@ class MaskShared(Masks):
     """`Masks` whose scores are a linear combination of own scores and of c that were received.
 
     Each weight tensor l has s = sum_i a_i s_i + a_own s_own, where a is the softmax of c + 1 trained numbers b_l; the
-    received scores s_i are fixed. Received scores replace those before, of which the own scores keep their share
-    (`receive`). Without an exchange nothing is received, and this is `Masks` with random scores for each task.
+    received scores s_i are fixed. New received scores replace the earlier ones (`receive`). Without an exchange this is
+    `Masks` with random scores for each task.
 
     Stored are 4 P bytes more for each of the c received scores.
 
@@ -75,7 +75,7 @@ class MaskShared(Masks):
 
     @torch.no_grad()
     def receive(self, scores: Tensor, own_share: float) -> None:
-        """Combine with other scores in place of those received before; the own scores become the present combination.
+        """Combine with other scores in place of earlier ones; the own scores become the present combination.
 
         Args:
             scores: float32 [c, P], 1 <= c <= `max_received`.
@@ -91,7 +91,7 @@ class MaskShared(Masks):
         self.agent.weights_changed()
 
     def _keep(self, scores: Tensor) -> None:
-        """Keep received scores, [c, P]; for compiled steps, made for each number, zeros fill up to 1, 2, 4, 8 ..."""
+        """Keep received scores, [c, P], filled with zeros up to 1, 2, 4, 8 ... for compiled steps."""
         count = len(scores)
         room = 2 ** (count - 1).bit_length() if count and self.agent.compiled_step is not None else count
         excluded = room - count

@@ -1,7 +1,7 @@
-"""The base classes of lifelong-learning methods, and an agent with a method, which is an agent like any other.
+"""The base classes of lifelong-learning methods, and an agent with a method.
 
-An agent calls the method's hooks in each gradient step, `AgentWithMethod` the others at batches, at task changes and in
-evaluation. A method knows the network's weights as one vector and the losses by name, and no agent in particular.
+An agent calls the method's hooks in each gradient step, `AgentWithMethod` those at batches, task changes and
+evaluation. A method knows the weights as one vector and the losses by name.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 
 
 class Method(TakesNumbers, Hooks):
-    """A method that does nothing, from which others derive: the agent is fine-tuned on one task after the other."""
+    """A method that does nothing, from which others derive: fine-tuning."""
 
     stackable = False
 
     needs_task_id: bool = False
-    """Whether it needs the id of the task, in learning and in evaluation."""
+    """Whether learning and evaluation need the task's id."""
 
     hidden_ids_hint = ""
-    """What else can be done where ids are hidden, for the message that refuses them."""
+    """The way out where ids are hidden, for the message that refuses them."""
 
     needs_boundaries: bool = True
     """Whether task changes must be announced."""
 
     reads_tasks: str = ""
-    """What it reads of the curriculum's tasks beside their ids, for the message that refuses a detector's labels."""
+    """What it reads of tasks beside ids, for the message that refuses a detector's labels."""
 
     max_labels: int | None = None
-    """The largest number of ids, where they are the labels of a detector; None: those of the curriculum's tasks."""
+    """Most ids if they are a detector's labels; None: those of the curriculum's tasks."""
 
     agent_members: tuple[str, ...] = ("method", "weights")
-    """The members of `Learner` that it uses beside those of `ctgraph_rl.agent.Agent`."""
+    """Members of `Learner` that it uses beside those of `ctgraph_rl.agent.Agent`."""
 
     agent: Learner  # or another module with the members that `agent_members` lists
     weights: Weights
@@ -54,7 +54,7 @@ class Method(TakesNumbers, Hooks):
         super().__init__()
 
     def prepare(self, curriculum: Curriculum) -> Curriculum:
-        """Return the curriculum to learn in place of the given one, mostly the same.
+        """Return the curriculum to learn, mostly the given one.
 
         Raises:
             ValueError: if the curriculum's protocol hides what the method needs.
@@ -84,8 +84,8 @@ class Method(TakesNumbers, Hooks):
         """Return the agent with this method attached.
 
         Args:
-            agent: a `Learner`, or another module that has `agent_members` and calls the hooks of ``agent.method``.
-            curriculum: what `prepare` returned.
+            agent: a `Learner`, or a module with `agent_members` that calls the hooks of ``agent.method``.
+            curriculum: from `prepare`.
 
         Raises:
             ValueError: if agent and method do not fit together.
@@ -107,7 +107,7 @@ class Method(TakesNumbers, Hooks):
         return AgentWithMethod(cast(Learner, agent), self, curriculum)
 
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        """Called once, when the method is attached to an agent: register buffers and parameters here.
+        """Called once when the method is attached: register buffers and parameters here.
 
         Raises:
             ValueError: if agent and method do not fit together.
@@ -116,7 +116,7 @@ class Method(TakesNumbers, Hooks):
         self.weights = weights
 
     def network_weights(self, trained: list[nn.Parameter]) -> list[nn.Parameter]:
-        """Return the network's, whatever the optimiser trains in their place."""
+        """Return the network's, whatever the optimiser trains."""
         return self.weights.parameters
 
     def start_task(self, task: int | None) -> None:
@@ -126,17 +126,17 @@ class Method(TakesNumbers, Hooks):
         """Called at the end of a task."""
 
     def on_batch(self, batch: TensorDictBase) -> None:
-        """Called with each batch, [num_envs, num_steps], before the agent learns from it."""
+        """Called with each batch, [num_envs, num_steps], before learning."""
 
     def after_learning(self) -> None:
-        """Called after the agent has learned from a batch."""
+        """Called after each batch was learned from."""
 
     def task_weights(self, task: int) -> Tensor | None:
         """Return the weights to act with in a task, float32 [P]; None for the present ones."""
         return None
 
     def num_ids(self, curriculum: Curriculum) -> int:
-        """Return the largest number of different ids that tasks start with."""
+        """Return the most different ids that tasks start with."""
         return len(curriculum.tasks) if self.max_labels is None else self.max_labels
 
 
@@ -146,21 +146,21 @@ def multi_task_blocks(curriculum: Curriculum) -> list[int]:
 
 
 class TaskMethod(Method):
-    """A method that keeps something for each task, in slots that are assigned in the order in which tasks start.
+    """A method with a slot for each task, in the order in which tasks start.
 
-    A task that has not started yet is played with the first slot.
+    A task that has not started is played with the first slot.
     """
 
     needs_task_id = True
     agent_members = (*Method.agent_members, "weights_changed")
 
     counts: ClassVar[tuple[str, ...]] = ()
-    """The attributes that are numbers and change; they are saved."""
+    """Attributes that are changing numbers and are saved."""
 
     def __init__(self) -> None:
         super().__init__()
         self.started: list[int] = []
-        """The ids of the tasks that have started, in the order of their slots."""
+        """The ids of started tasks, in the order of their slots."""
 
         self.slot = 0
         """The present task's."""
@@ -188,12 +188,12 @@ class TaskMethod(Method):
         return self.started.index(task) if task in self.started else 0
 
     def other_slot(self, task: int) -> int | None:
-        """Return the slot of a task; None if it is the present one, and before any task has started."""
+        """Return a task's slot; None if it is the present one or no task has started."""
         slot = self.slot_of(task)
         return slot if self.started and slot != self.slot else None
 
     def present_with(self, task: int, inside: Tensor, kept: Tensor) -> Tensor | None:
-        """Return the present weights with the part that belongs to the present task; None if that is the present one.
+        """Return the present weights with a task's part; None for the present task.
 
         Args:
             task: its id.
@@ -221,7 +221,7 @@ class TaskMethod(Method):
 
 
 class AgentWithMethod(nn.Module):
-    """An agent and a method; it calls the method's hooks at batches, at task changes and in evaluation.
+    """An agent and a method, whose hooks it calls at batches, task changes and evaluation.
 
     Args:
         agent: the agent, of which the method becomes a part.
@@ -253,7 +253,7 @@ class AgentWithMethod(nn.Module):
         return self.agent
 
     def policy_for(self, task: int) -> TensorDictModuleBase:
-        """Return the agent's policy, or a copy of it where the method has other weights for a task."""
+        """Return the agent's policy, or a copy where the method has other weights for a task."""
         weights = self.method.task_weights(task)
         policy = self.agent.policy_for(task)
         if weights is None:
@@ -280,7 +280,7 @@ class AgentWithMethod(nn.Module):
         self.method.end_task()
 
     def loss(self, batch: Mapping[Any, Tensor] | TensorDictBase) -> Mapping[str, Tensor]:
-        """Compute the agent's losses and the method's penalties."""
+        """Return the agent's losses and the method's penalties."""
         return {**self.agent.loss(batch), **self.method.penalties(batch, self.agent.weights)}
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:

@@ -15,10 +15,9 @@ from ctgraph_rl.tasks.switch import ByEpisode
 
 
 class Multitask(Method):
-    """One block with all tasks and frames replaces the curriculum's; each environment changes tasks at every episode.
+    """One block with all tasks and frames replaces the curriculum's; environments change tasks at every episode.
 
-    The agent is unchanged. Nothing is stored, and nothing can be forgotten. Without task ids only tasks that look
-    different can all be solved.
+    Nothing is stored or forgotten. Without task ids only tasks that look different can all be solved.
     """
 
     needs_boundaries = False

@@ -20,15 +20,15 @@ from ctgraph_rl.checks import is_real, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 FREE = -1
-"""Owner of a weight that no task has yet."""
+"""Owner of a free weight."""
 
 
 class PackNet(TaskMethod):
-    """In each block the free weights are trained; then the smallest are pruned, and the rest trained further and kept.
+    """In each block the free weights are trained, the smallest pruned, and the rest trained further and kept.
 
-    The k-th of K tasks keeps, of each weight matrix, the largest 1 / (K - k + 1) of the weights that are free; pruned
-    ones are 0 and free for later tasks. A task acts with the weights of the tasks up to it. Biases are those of the
-    first task, and each task has separate output layers, see `Heads`. A task that returns trains only those.
+    The k-th of K tasks keeps the largest 1 / (K - k + 1) of each matrix's free weights; pruned ones are 0 and free for
+    later tasks. A task acts with the weights of the tasks up to it. Biases are the first task's; each task has separate
+    output layers (`Heads`), which are all that a returning task trains.
 
     Stored are each weight's owner, 2 P bytes, whether it may change and whether the present task uses it, 2 P bytes,
     its value, 4 P bytes, and the output layers.
@@ -70,7 +70,7 @@ class PackNet(TaskMethod):
 
     @torch.no_grad()
     def start_task(self, task: int | None) -> None:
-        """Let free weights change; in a task that returns, only its output layers."""
+        """Let free weights change; in a returning task, only its output layers."""
         new = task not in self.started
         super().start_task(task)
         self.heads.start_task(task)
@@ -91,7 +91,7 @@ class PackNet(TaskMethod):
         self.heads.end_task()
 
     def on_batch(self, batch: TensorDictBase) -> None:
-        """Prune before the first batch that reaches into the share for retraining, unless it is the block's first."""
+        """Prune before the first batch in the share for retraining, but not before the block's first."""
         budget = self.budgets[self.block % len(self.budgets)]
         if self.frames and self.frames + batch.numel() > (1 - self.retrain) * budget:
             self._prune()
@@ -104,7 +104,7 @@ class PackNet(TaskMethod):
 
     @torch.no_grad()
     def after_step(self, weights: Sequence[Tensor]) -> None:
-        """Undo the optimiser's changes of weights that may not change."""
+        """Undo the optimiser's changes of fixed weights."""
         fixed = torch.where(self.mine, self.packed, 0.0)
         write_flat(torch.where(self.live, flat(weights), fixed), weights)
 
@@ -120,7 +120,7 @@ class PackNet(TaskMethod):
 
     @torch.no_grad()
     def _prune(self) -> None:
-        """Keep the largest of the free weights that were trained, and free the others."""
+        """Keep the largest of the trained free weights, and free the others."""
         trained = self.live & ~self._on_device(self.in_heads) & (self.owner == FREE)
         if not trained.any():
             return
@@ -137,12 +137,11 @@ class PackNet(TaskMethod):
         self._load()
 
     def _load(self) -> None:
-        """Load the present task's weights where they may not change."""
         self.after_step(self.weights.parameters)
         self.agent.weights_changed()
 
     def _kept_up_to(self, slot: int) -> Tensor:
-        """Return bool [P], true for the weights that the tasks up to this slot keep."""
+        """Return where the tasks up to this slot keep weights, bool [P]."""
         return (self.owner >= 0) & (self.owner <= slot)
 
     def _on_device(self, chosen: Tensor) -> Tensor:

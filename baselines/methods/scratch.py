@@ -13,9 +13,9 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 
 
 class Scratch(TaskMethod):
-    """Each task has its own network with random initial weights, and an optimiser without state.
+    """Each task has a separate network with random initial weights, and an optimiser without state.
 
-    Stored are 4 P bytes for each of the curriculum's tasks. Nothing is forgotten and nothing is transferred.
+    Stored are 4 P bytes for each of the curriculum's tasks.
     """
 
     stackable = True
@@ -34,7 +34,7 @@ class Scratch(TaskMethod):
         self.register_buffer("kept", weights.zeros().repeat(self.num_tasks, 1))
 
     def start_task(self, task: int | None) -> None:
-        """Load the task's network; the first task takes that of the new agent."""
+        """Load the task's network; the first task takes the new agent's."""
         first = not self.started
         known = task in self.started
         super().start_task(task)

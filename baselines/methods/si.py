@@ -25,8 +25,8 @@ class SI(Importance):
     v_i is the sum over gradient steps of -(d loss / d w_i) times the change of w_i, with the gradient of the agent's
     own losses; d_i is the change of w_i over the task; a are the weights at the end of the last task.
 
-    Stored are, besides what `Importance` stores, v, the weights at the task's start and two vectors of a step: 28 P
-    bytes in all.
+    Beside those of `Importance`, v, the weights at the task's start and two vectors of a step are stored: 28 P bytes in
+    all.
 
     Args:
         epsilon: xi, which is added to the divisor.
@@ -61,7 +61,7 @@ class SI(Importance):
 
     @torch.no_grad()
     def transform_gradients(self, gradients: Sequence[Tensor], weights: Sequence[Tensor]) -> Sequence[Tensor]:
-        """Return the same, and store the part that comes from the agent's own losses."""
+        """Return the gradients, and store the part of the agent's losses."""
         self.before.copy_(flat(weights))
         added = 2 * self.coeff * self.importance * (self.before - self.anchor)
         self.slope.copy_(flat(gradients) - added)
@@ -73,5 +73,5 @@ class SI(Importance):
         self.path -= self.slope * (flat(weights) - self.before)
 
     def task_importance(self) -> Tensor:
-        """Return the fall of the loss along the path, divided by the squared changes of the weights."""
+        """Return the fall of the loss along the path, by the squared changes of the weights."""
         return self.path.clamp(min=0) / ((self.weights.vector().detach() - self.start).square() + self.epsilon)

@@ -1,4 +1,4 @@
-"""A GRU: a recurrent network that predicts the next pair of observation and reward from all that came before."""
+"""A GRU that predicts the next pair of observation and reward from all that came before."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NUM_EPOCHS = 40
 class GRUModel:
     """An embedding of observation and action, a GRU over the rows, and logits of all pairs.
 
-    It is not reset where an episode ends: the home state tells it. Learning minimises the mean bits by Adam.
+    It does not reset at episodes' ends, which the home state shows. Learning minimises the mean bits by Adam.
 
     Args:
         symbols: the images and rewards.
@@ -39,7 +39,7 @@ class GRUModel:
         self.optimiser = torch.optim.Adam(layers.parameters(), lr=0.01)
 
     def learn(self, transitions: Transitions) -> None:
-        """See `Predictor`; minibatches of 16 rows."""
+        """Learn as a `Predictor`, in minibatches of 16 rows."""
         for _ in range(NUM_EPOCHS):
             order = torch.randperm(len(transitions.pair), generator=self.generator, device="cpu")
             for rows in order.split(16):
@@ -48,7 +48,7 @@ class GRUModel:
 
     @torch.no_grad()
     def bits(self, transitions: Transitions) -> Tensor:
-        """See `Predictor`."""
+        """Return bits as a `Predictor`."""
         return self._nats(transitions) / math.log(2)
 
     def _nats(self, transitions: Transitions) -> Tensor:

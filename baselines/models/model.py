@@ -1,4 +1,4 @@
-"""What predictors learn from and how they are scored: bits a step above the exact entropy of the environment."""
+"""What predictors learn from, and their score: bits a step above the environment's exact entropy."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ctgraph_rl.tasks.observability import transition_entropy
 from ctgraph_rl.tasks.task import Task, ct_graphs
 
 NUM_ROWS = 64
-"""Rows side by side that a policy meets a task in."""
+"""Rows in which a policy meets a task."""
 
 
 class Transitions(NamedTuple):
@@ -30,10 +30,10 @@ class Transitions(NamedTuple):
 
 
 class Symbols:
-    """The images and rewards of tasks as numbers, so that predictors give them probabilities.
+    """The images and rewards of tasks as numbers, to which predictors give probabilities.
 
     Args:
-        tasks: whose images differ in nothing but their pixels, without noise or rotation on read.
+        tasks: whose images differ in pixels only, without noise or rotation on read.
 
     Raises:
         ValueError: for tasks whose images vary on read, or differ in shape.
@@ -61,7 +61,7 @@ class Symbols:
         self.num_pairs = len(self.images) * len(self.rewards)
 
     def of(self, batch: TensorDictBase) -> Transitions:
-        """Return the transitions of a batch that an agent learns from, [rows, steps] in time order.
+        """Return a batch's transitions, [rows, steps] in time order.
 
         Raises:
             ValueError: for an image that no task has.
@@ -81,10 +81,10 @@ class Symbols:
 
 
 class Predictor(Protocol):
-    """Gives the next observation and reward probabilities, from the observations and actions so far."""
+    """Gives the next observation and reward probabilities, given all observations and actions so far."""
 
     def learn(self, transitions: Transitions) -> None:
-        """Learn from data, in addition to what was learned before."""
+        """Learn from data, in addition to earlier ones."""
         ...
 
     def bits(self, transitions: Transitions) -> Tensor:
@@ -106,8 +106,8 @@ def experience(
         task: the task.
         symbols: of it and all tasks that the predictor meets.
         policy: an agent's ``policy``, which samples, or a class of `ctgraph_rl.policies`.
-        num_steps: steps of each of 64 rows; episodes follow each other.
-        seed: of the environment and of torch's generator, which is left as it was.
+        num_steps: steps of each of 64 rows.
+        seed: of the environment and of torch's generator, whose state is restored.
         initial_state: of an agent with memory.
     """
     env = CTGraphEnv([task] * NUM_ROWS, seed)
@@ -119,7 +119,7 @@ def experience(
 
 
 def learned_share(model: Predictor, test: Transitions, task: Task, policy: str = "navigation") -> float:
-    """Return how much of what can be predicted is predicted: 1 is the exact model, 0 knows frequencies and no more.
+    """Return the share of what can be predicted: 1 is the exact model, 0 knows frequencies only.
 
     1 - (bits - H) / (U - H), with the exact H and U of `transition_entropy` with and without information. It is below 0
     for a predictor that is wrong and sure.
@@ -128,7 +128,7 @@ def learned_share(model: Predictor, test: Transitions, task: Task, policy: str =
         model: the predictor.
         test: transitions of the named policy that it has not learned from.
         task: what they are of.
-        policy: the name of the policy; see `transition_entropy`.
+        policy: a name as for `transition_entropy`.
     """
     exact = transition_entropy(task, policy)
     frequencies = transition_entropy(task, policy, informed=False)
@@ -136,14 +136,14 @@ def learned_share(model: Predictor, test: Transitions, task: Task, policy: str =
 
 
 def performance_matrix(make: Callable[[Symbols], Predictor], tasks: Sequence[Task], num_steps: int = 256) -> Tensor:
-    """Return `learned_share` of each task after each of them was learned in order, float64 [tasks + 1, tasks].
+    """Return `learned_share` of each task after each was learned in order, float64 [tasks + 1, tasks].
 
     Metrics of the performance matrix take it, such as ``forgetting(matrix, [[0], [1]])``. Data are of a policy that
     navigates; test data have another seed.
 
     Args:
         make: builds the predictor of symbols, such as `baselines.models.table_model.TableModel`.
-        tasks: what is learned, one after the other.
+        tasks: what is learned, in order.
         num_steps: steps of each of 64 rows to learn from, and as many to test.
 
     Example:

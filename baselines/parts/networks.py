@@ -164,7 +164,7 @@ class EncoderModule(TensorDictModule):
         return {HISTORY: groups.view(inputs[0].shape[:2])}
 
     def of_histories(self, data: Data) -> tuple[Tensor, Tensor]:
-        """Return features of different frames, [n, num_features], and the number of each frame's, int64 [num_frames]."""
+        """Return features of different frames, [n, num_features], and the number of each, int64 [num_frames]."""
         examples, groups = renumber(data[HISTORY])
         features = self.module(*(data[key].index_select(0, examples) for key in self.in_keys))
         return features, groups
@@ -231,7 +231,7 @@ class RecurrentModule(TensorDictModuleBase):
         return faster(inputs, groups, starts, state)
 
     def of_histories(self, data: Data) -> tuple[Tensor, Tensor]:
-        """Return ``memory`` of different histories, [n, num_outputs], and the number of each frame's, [rows * steps]."""
+        """Return ``memory`` of different histories, [n, num_outputs], and each frame's number, [rows * steps]."""
         inputs, groups, starts, state = self._sequences(data)
         found = histories.tree(data[HISTORY], starts)
         of_last = groups.flatten().index_select(0, found.frames)
