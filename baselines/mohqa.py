@@ -1,21 +1,21 @@
 """MOHQA: a modulated Hebbian network (MOHN) beside a Q-network, for rewards that come long after decisions.
 
-Ladosz et al. 2021, "Deep reinforcement learning with modulated Hebbian plus Q-network architecture" (IEEE TNNLS,
-arXiv 1909.09902). Features phi of an observation give action values q = sigmoid(W_q relu(phi)), which are learned by
-gradients, and u = sigmoid(W_h y) with y = tanh(phi + noise - average), which are not. It acts greedily on q + u, or at
-random. The average is exponential over the steps of acting: average <- d average + (1 - d) phi, after y was computed.
+Ladosz et al. 2021, "Deep reinforcement learning with modulated Hebbian plus Q-network architecture" (IEEE TNNLS, arXiv
+1909.09902). Features phi of an observation give action values q = sigmoid(W_q relu(phi)), learned by gradients, and u =
+sigmoid(W_h y) with y = tanh(phi + noise - average), which is not. It acts greedily on q + u, or at random. After y,
+average <- d average + (1 - d) phi.
 
 After each action the eligibility decays, E <- exp(-1 / tau) E, and its row of that action changes by +c where y is
-largest, by -c where it is smallest, and by -h elsewhere; E = 0 at the start of an episode. With reward r,
-W_h <- clip(W_h + (sign(r) - b) E, -1, 1). So a wait between decision and reward does not hide the decision, as it does
-from one-step Q-learning. Targets are r + gamma max(q' + u') with a copy of all weights and the average that was stored
-with the transition, and the published loss is |q - target|^2: the prediction lacks u, and q, which is at most 1, cannot
-reach a target above 1. ``predict_sum`` is the correction, with |q + u - target|^2, where u is a constant.
+largest, by -c where it is smallest, and by -h elsewhere; E = 0 at the start of an episode. With reward r, W_h <-
+clip(W_h + (sign(r) - b) E, -1, 1). So a wait does not hide the decision from the reward. Targets are r + gamma max(q' +
+u') with a copy of all weights and the transition's stored average. The published loss is |q - target|^2: the prediction
+lacks u, and q, at most 1, cannot reach a target above 1. ``predict_sum`` corrects it to |q + u - target|^2 with a
+constant u.
 
-The paper has one environment, a batch of one step then gives its updates exactly. With more of both, W_h changes after
-the batch, step by step in time, by the sum over environments; each has its own E and average, and a new one starts
-with the mean average. Convolutions are replaced by the encoder of the other agents. The environment's state takes
-4 num_features (num_actions + 1) bytes each, W_h and its copy 8 num_features num_actions.
+One environment and batches of one step give the paper's updates exactly. With more, W_h changes after the batch, step
+by step, by the sum over environments; each has an E and an average, and a new one starts with the mean average. The
+encoder is that of the other agents. State takes 4 num_features (num_actions + 1) bytes an environment, W_h and its copy
+8 num_features num_actions.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from baselines.parts.q_learning import QLearner, QLearnerSettings, require_repla
 from ctgraph_rl.checks import at_least_one, at_most, fraction, not_negative, positive, require, true_or_false
 
 STATE = ("eligibility", "average", "trial")
-"""The state of an environment; ``trial`` says that the average lasts over episodes."""
+"""The state of an environment; by ``trial`` the average lasts over episodes."""
 
 RMSPROP_ALPHA = 0.95
 RMSPROP_EPS = 0.01
@@ -87,26 +87,20 @@ class MOHQASettings(QLearnerSettings):
 
 
 class Projected(nn.Module):
-    """An encoder with a linear layer behind it.
-
-    Args:
-        encoder: of observations.
-        num_inputs: width of its features.
-        num_features: outputs.
-    """
+    """An encoder and a linear layer."""
 
     def __init__(self, encoder: nn.Module, num_inputs: int, num_features: int) -> None:
         super().__init__()
         self.encoder = encoder
         self.linear = linear_layer(num_inputs, num_features)
 
+    @override
     def forward(self, *inputs: Tensor) -> Tensor:
-        """Map the encoder's inputs to float32 [..., num_features]."""
         return self.linear(self.encoder(*inputs))
 
 
 class HebbianHead(nn.Module):
-    """The weights W_h and how eligibility and weights change.
+    """The weights W_h, and how eligibility and weights change.
 
     Args:
         settings: of the agent.
@@ -123,7 +117,7 @@ class HebbianHead(nn.Module):
         self.register_buffer("weights", weights)
 
     def forward(self, y: Tensor) -> Tensor:
-        """Compute u, [..., num_actions], from y, [..., num_features]."""
+        """Return u, [..., num_actions], from y, [..., num_features]."""
         return nn.functional.linear(y, self.weights).sigmoid()
 
     def eligibility(self, before: Tensor, y: Tensor, action: Tensor) -> Tensor:
@@ -151,7 +145,7 @@ class HebbianHead(nn.Module):
 
 
 class ModulatedGreedy(TensorDictModuleBase):
-    """The policy: greedy on q + u, with exploration; it writes eligibility and average.
+    """The policy: greedy on q + u, with exploration; writes eligibility and average.
 
     Args:
         trunk: computes phi.
@@ -196,16 +190,16 @@ class ModulatedGreedy(TensorDictModuleBase):
         return tensordict.set(("next", "trial"), tensordict["trial"])
 
     def features(self, data: Data) -> Tensor:
-        """Compute phi at any number of steps, [..., num_features]."""
+        """Return phi at any number of steps, [..., num_features]."""
         return self.greedy[0].over_time(data)
 
     def head(self, features: Tensor) -> Tensor:
-        """Compute q, [..., num_actions]."""
+        """Return q, [..., num_actions]."""
         return self.greedy[1].module(features)
 
 
 class MOHQA(QLearner):
-    """A Q-network with a modulated Hebbian network beside it; its settings are `MOHQASettings`."""
+    """A Q-network with a modulated Hebbian network beside it."""
 
     Settings = MOHQASettings
     solves = "fully observable tasks (CT-FO); its traces reach over waits that look alike"
@@ -239,7 +233,7 @@ class MOHQA(QLearner):
         require_replay(observation_spec, given.buffer_size, given.batch_size, 2 * given.num_features)
 
     def initial_state(self, num_envs: int) -> TensorDict:
-        """Return no eligibility, and the mean average of the environments."""
+        """Return no eligibility, and the environments' mean average."""
         weights = self.hebbian.weights
         average = self.average.expand(num_envs, -1)
         state = {"eligibility": weights.new_zeros(num_envs, *weights.shape), "average": average.clone()}
@@ -247,7 +241,7 @@ class MOHQA(QLearner):
 
     @override
     def reset_parameters(self) -> None:
-        """The weights of the Hebbian network and the average are 0 again."""
+        """The Hebbian weights and the average are 0 again."""
         super().reset_parameters()
         self.hebbian.weights.zero_()
         self.average.zero_()
@@ -262,19 +256,19 @@ class MOHQA(QLearner):
         self.target_weights.copy_(self.hebbian.weights)
 
     def values(self, data: Data) -> Tensor:
-        """Compute q + u, where u is a constant, [..., num_actions]."""
+        """Return q + u, where u is a constant, [..., num_actions]."""
         features = self.policy.features(data)
         return self.policy.head(features) + self.hebbian((features - data["average"]).tanh()).detach()
 
     def minibatches(self, batch: TensorDictBase) -> Iterator[Items]:
-        """Change W_h by the rewards of a batch; store it, and yield minibatches of replayed items."""
+        """Change W_h by a batch's rewards; store it, and yield replayed minibatches."""
         self.hebbian.modulate(batch["next", "eligibility"], batch["next", "reward"])
         self.average.copy_(batch["next", "average"][:, -1].mean(dim=0))
         yield from super().minibatches(batch)
 
     @override
     def with_targets(self, batch: TensorDictBase) -> TensorDictBase:
-        """One step needs none of `MultiStep`'s operations, which take long for a batch of one step."""
+        """One step needs none of `MultiStep`'s slow operations."""
         if self.multi_step.n_steps > 1:
             return super().with_targets(batch)
         steps = torch.ones(batch.shape, dtype=torch.int64, device=batch.device)
@@ -287,7 +281,7 @@ class MOHQA(QLearner):
         return batch.select(*seen, "action", *after, "steps_to_next_obs").reshape(-1)
 
     def loss(self, batch: Data, others: Data | None = None) -> TensorsByName:
-        """Compute the mean squared error of the value of the action taken; the targets are those of q' + u'."""
+        """Return the mean squared error of the taken action's value, with targets of q' + u'."""
         values = self.values(batch) if self.settings.predict_sum else self.policy.head(self.policy.features(batch))
         predicted = values.gather(-1, batch["action"].unsqueeze(-1))
         after = {key: batch["next", key] for key in (*self.policy.greedy.in_keys, "average")}

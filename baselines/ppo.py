@@ -40,7 +40,7 @@ class PPOSettings(PolicyGradientSettings):
 
 
 class PPO(PolicyGradient):
-    """PPO for tasks that need no memory; its settings are `PPOSettings`."""
+    """PPO for tasks that need no memory."""
 
     Settings: ClassVar[Any] = PPOSettings
     solves = "fully observable tasks (CT-FO)"
@@ -56,7 +56,7 @@ class PPO(PolicyGradient):
         self.clip_range = torch.tensor([-epsilon, epsilon], dtype=torch.float32, device="cpu").log1p().tolist()
 
     def loss(self, batch: Data) -> TensorsByName:
-        """Compute the clipped surrogate, eq. (7), critic's and entropy losses, as TorchRL's `ClipPPOLoss` does."""
+        """Return the losses of the clipped surrogate, eq. (7), critic and entropy, as TorchRL's `ClipPPOLoss`."""
         frames, log_probs, taken, values = self.evaluate_actions(batch)
         change = taken - frames["action_log_prob"].unsqueeze(-1)
         gain = change.exp() * frames["advantage"]

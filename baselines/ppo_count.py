@@ -1,7 +1,7 @@
 """PPO with a bonus for rarely seen observations, for exploration where rewards are rare.
 
-Counts of hashed observations, "#Exploration", Tang et al. 2017 (arXiv 1611.04717): a step that leads to an observation
-gets a bonus of coeff / sqrt(times that its hash was seen), in addition to the environment's reward.
+Counts of hashed observations, "#Exploration", Tang et al. 2017 (arXiv 1611.04717): an observation adds coeff /
+sqrt(times that its hash was seen) to the reward of the step before.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class SimHashCounts(nn.Module):
         self.register_buffer("counts", torch.zeros(2**num_bits, dtype=torch.int64, device="cpu"))
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Count a batch of uint8 observations, and return how often each was seen so far, int64 [n]."""
+        """Count uint8 observations, and return how often each was seen so far, int64 [n]."""
         flat = observation.reshape(-1, self.num_inputs).float() * self.scale - 1
         signs = (flat @ self.projection > 0).long()
         codes = (signs << torch.arange(signs.shape[1], device=signs.device)).sum(dim=1)
@@ -61,7 +61,7 @@ class PPOCountSettings(PPOSettings):
 
 
 class PPOCount(PPO):
-    """PPO with a count-based exploration bonus; its settings are `PPOCountSettings`."""
+    """PPO with a count-based exploration bonus."""
 
     Settings = PPOCountSettings
     solves = "fully observable tasks (CT-FO) whose goal random actions almost never reach"
@@ -80,5 +80,5 @@ class PPOCount(PPO):
         return super().reward(batch) + self.bonus(batch["next", "observation"]).view(*batch.shape, 1)
 
     def bonus(self, observation: Tensor) -> Tensor:
-        """Count observations, and return the bonus for each, float32 [n]."""
+        """Count observations, and return the bonus of each, float32 [n]."""
         return self.settings.bonus_coeff * self.seen(observation).float().rsqrt()

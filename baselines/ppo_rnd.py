@@ -2,20 +2,20 @@
 
 Random network distillation, Burda et al. 2019 (arXiv 1810.12894): a predictor g learns the outputs of a fixed random
 network f. A step that leads to observation o' gets the bonus |g(o') - f(o')|^2, which falls as o' is seen more often,
-divided by the standard deviation of its discounted returns. The bonus has its own critic and discount factor,
-and its return does not end with an episode. PPO learns from the advantages A + bonus_coeff A_bonus.
+divided by the standard deviation of its discounted returns. The bonus has a separate critic and discount factor, and
+its return does not end with an episode. PPO learns from the advantages A + bonus_coeff A_bonus.
 
-Both networks read observations that are standardised pixel by pixel and limited to [-5, 5]. Five things differ from
-the paper:
+Both networks read observations that are standardised pixel by pixel and limited to [-5, 5]. Five things differ from the
+paper:
 
 - Predictor and random network have the same shape.
 - The critic of the bonus shares no layer with the policy, so that lifelong-learning methods act on the policy only.
-- Predictor and critic of the bonus have their own optimiser and learning rate.
+- Predictor and critic of the bonus have a separate optimiser and learning rate.
 - Each announced task starts with a new predictor, critic of the bonus and statistics.
-- Statistics of observations start with the first batch, not with steps of a random policy before training.
+- Statistics of observations start with the first batch, not with a random policy.
 
-Beside PPO's own, the agent holds 12 bytes for each weight of the predictor and of the bonus's critic, 4 for each of
-the random network, 16 for each pixel and 4 for each environment.
+The agent holds 12 bytes for each weight of the predictor and of the bonus's critic, 4 for each of the random network,
+16 for each pixel and 4 for each environment, beside PPO's.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ from baselines.update.update import make_optimiser, minimise
 from ctgraph_rl.checks import NamedValues, at_least_one, fraction, not_negative, positive, require, require_memory
 
 LARGEST_INPUT = 5.0
-"""Standard deviations from the mean to which observations are limited."""
+"""Standard deviations to which observations are limited."""
 
 
 class Moments(nn.Module):
-    """Mean and variance of all rows seen so far, in float64.
+    """Mean and variance of all rows so far, in float64.
 
     Args:
         size: numbers in a row.
@@ -118,7 +118,7 @@ class Novelty(nn.Module):
         self.returns.zero_()
 
     def forward(self, observations: Tensor) -> Tensor:
-        """Compute the predictor's error at uint8 observations, float32 [n]: the mean square over features."""
+        """Return the predictor's error at uint8 observations, float32 [n]: the mean square over features."""
         moments = self.of_observations
         inputs = (self._flat(observations) - moments.mean.float()) * (moments.variance + 1e-6).rsqrt().float()
         inputs = inputs.clamp(-LARGEST_INPUT, LARGEST_INPUT)
@@ -126,9 +126,9 @@ class Novelty(nn.Module):
 
     @torch.no_grad()
     def bonus(self, observations: Tensor) -> Tensor:
-        """Return the bonus for the observations of a batch, [num_envs, num_steps, ...]: float32 [num_envs, num_steps].
+        """Return the bonus for observations, [num_envs, num_steps, ...]: float32 [num_envs, num_steps].
 
-        The statistics are those up to and with this batch.
+        The statistics include this batch.
         """
         self.of_observations.update(self._flat(observations))
         errors = self(observations).view(observations.shape[:2])
@@ -165,7 +165,7 @@ class PPORNDSettings(PPOSettings):
 
 
 class PPORND(PPO):
-    """PPO with random network distillation; its settings are `PPORNDSettings`."""
+    """PPO with random network distillation."""
 
     Settings = PPORNDSettings
     solves = "fully observable tasks (CT-FO) whose goal random actions almost never reach"
@@ -188,18 +188,18 @@ class PPORND(PPO):
         self.bonus_optimiser = make_optimiser("adam", learned, self.settings.bonus_learning_rate)
 
     def start_task(self, task: int | None = None) -> None:
-        """Draw a new predictor and a new critic of the bonus, and reset their optimiser and all statistics."""
+        """Draw a new predictor and critic of the bonus, and reset their optimiser and all statistics."""
         self.novelty.reset()
         self.bonus_critic.apply(reset_layer)
         self._make_bonus_optimiser()
 
     def bonus_values(self, data: Data) -> Tensor:
-        """Compute the values of the bonus at any number of steps, [..., 1]."""
+        """Return the values of the bonus at any number of steps, [..., 1]."""
         features, head = self.bonus_critic
         return head.module(features.over_time(data))
 
     def minibatches(self, batch: TensorDictBase) -> Iterator[Items]:
-        """Yield the minibatches of all epochs; predictor and critic of the bonus learn from each before PPO does."""
+        """Yield the minibatches of all epochs; predictor and critic of the bonus learn from each before PPO."""
         for minibatch in super().minibatches(batch):
             observations = minibatch.pop("next_observation")
             target = minibatch.pop("bonus_target")
@@ -216,14 +216,14 @@ class PPORND(PPO):
         return given | {"bonus_target": target, "next_observation": batch["next", "observation"]}
 
     def advantages(self, batch: TensorDictBase, *given: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the advantages, the sum of the reward's and the weighted bonus's, and the critic's targets."""
+        """Return the sum of the reward's and the weighted bonus's advantages, and the critic's targets."""
         advantage, target = super().advantages(batch, *given)
         return advantage + self.settings.bonus_coeff * batch["bonus_advantage"], target
 
     def bonus_advantages(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Compute the bonus's advantages and the targets of its critic, [num_envs, num_steps, 1] each.
+        """Return the bonus's advantages and its critic's targets, [num_envs, num_steps, 1] each.
 
-        After the last step of an episode follows the first one of the next, whose value counts.
+        Returns continue over the ends of episodes.
         """
         bonus = self.novelty.bonus(batch["next", "observation"]).unsqueeze(-1)
         values = self.bonus_values(batch)

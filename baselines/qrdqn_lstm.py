@@ -27,7 +27,7 @@ class QRDQNLSTMSettings(RecurrentQSettings):
 
 
 class QRDQNLSTM(RecurrentQ):
-    """Recurrent Q-learning of K quantiles for each action; its settings are `QRDQNLSTMSettings`."""
+    """Recurrent Q-learning of K quantiles for each action."""
 
     Settings = QRDQNLSTMSettings
     solves = "partially observable tasks too, if episodes are short enough to remember"
@@ -38,7 +38,7 @@ class QRDQNLSTM(RecurrentQ):
         return self.settings.num_quantiles
 
     def distance(self, predicted: Tensor, target: Tensor) -> Tensor:
-        """Compute the quantile Huber loss, eq. (10) of the paper with kappa = 1, summed over predicted quantiles."""
+        """Return the quantile Huber loss, eq. (10) of the paper with kappa = 1, summed over predicted quantiles."""
         predicted, target = torch.broadcast_tensors(predicted.unsqueeze(-1), target.unsqueeze(-2))
         count = predicted.shape[-2]
         numbers = torch.arange(count, dtype=torch.float32, device=predicted.device)

@@ -1,8 +1,8 @@
 """RL^2: an LSTM that reads its last action and reward and keeps its state over the episodes of a trial.
 
 Duan et al. 2016 (arXiv 1611.02779) and Wang et al. 2016 (arXiv 1611.05763), trained by PPO. A trial is a number of
-episodes with one goal, such as a task with ``goal_change=(4, 4)`` and trials of 4. PPO maximises the return of the
-whole trial, so an early episode may be spent on search.
+episodes with one goal, such as 4 with ``goal_change=(4, 4)``. PPO maximises the trial's return, so an early episode may
+search.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from ctgraph_rl.checks import at_least_one, require
 from ctgraph_rl.core.dynamics import OUTCOME_GOAL
 
 OWN_KEYS = ("trial", "previous_action", "reward")
-"""The state beside the LSTM's: the number of the episode in its trial, and the last action and reward."""
+"""The state beside the LSTM's: the episode's number in its trial, and the last action and reward."""
 
 
 class TrialTrunk(TensorDictModuleBase):
-    """A recurrent trunk whose state is reset at the start of a trial, and which reads the last action and reward.
+    """A recurrent trunk whose state resets at the start of a trial, and which reads the last action and reward.
 
     Args:
         trunk: a `recurrent` trunk that also reads ``previous``, [num_actions + 1].
@@ -47,28 +47,28 @@ class TrialTrunk(TensorDictModuleBase):
         self.out_keys = [*trunk.out_keys, ("next", "trial")]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``memory``, the LSTM's next state and the number of the episode in its trial, from 1."""
+        """Write ``memory``, the LSTM's next state and the episode's number in its trial, from 1."""
         return tensordict.update(self.act(tensordict))
 
     def act(self, data: Data) -> Items:
-        """Compute ``memory`` and the next state for one step of all rows."""
+        """Return ``memory`` and the next state for one step of all rows."""
         inputs, episode = self._inputs(data)
         return {**self.trunk.act(inputs), ("next", "trial"): torch.where(inputs["is_init"], 1, episode)}
 
     def over_time(self, data: Data) -> Tensor:
-        """Compute ``memory`` at all steps of sequences [rows, steps]."""
+        """Return ``memory`` at all steps of sequences [rows, steps]."""
         return self.trunk.over_time(self._inputs(data)[0])
 
     def number_histories(self, data: Data) -> Items:
-        """Number the inputs and the histories of frames, int64 [rows, steps] each; see `RecurrentModule`."""
+        """Number the inputs and the histories of frames, int64 [rows, steps] each, as `RecurrentModule`."""
         return self.trunk.number_histories(self._inputs(data)[0])
 
     def of_histories(self, data: Data) -> tuple[Tensor, Tensor]:
-        """Compute ``memory`` of different histories, and which of them each frame has; see `RecurrentModule`."""
+        """Return ``memory`` of different histories, and the number of each frame's, as `RecurrentModule`."""
         return self.trunk.of_histories(self._inputs(data)[0])
 
     def _inputs(self, data: Data) -> tuple[TensorsByName, Tensor]:
-        """Return the inputs of the inner trunk, and the number of the episode in its trial, from 1."""
+        """Return the inner trunk's inputs, and the episode's number in its trial, from 1."""
         episode = data["trial"] + data["is_init"]
         fresh = data["is_init"] & ((episode == 1) | (episode > self.trial_episodes))
         inputs = {key: data[key] for key in (*self.trunk.in_keys, INPUT, HISTORY) if key != "previous" and key in data}
@@ -89,7 +89,7 @@ class RL2Settings(PPOSettings):
 
 
 class RL2(PPO):
-    """PPO over trials of several episodes, over which the LSTM keeps its state; its settings are `RL2Settings`."""
+    """PPO over trials of several episodes, over which the LSTM keeps its state."""
 
     Settings = RL2Settings
     memory = True
@@ -110,10 +110,9 @@ class RL2(PPO):
         return TrialTrunk(trunk, num_actions, self.settings.trial_episodes)
 
     def initial_state(self, num_envs: int) -> TensorDict:
-        """Return the state before the first trial: zeros.
+        """Return zeros before the first trial.
 
-        The loop must carry a state with the key ``trial`` over the ends of episodes as it does from step to step; the
-        trunk resets it.
+        The loop carries a state with the key ``trial`` over the ends of episodes; the trunk resets it.
         """
         state = self.trunk.trunk.zero_state(num_envs)
         device = next(self.parameters()).device
@@ -124,7 +123,7 @@ class RL2(PPO):
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Learn from a batch; return mean losses and the success rates of the first and last episodes of trials.
 
-        The last step of a batch only provides the value to bootstrap from, so a batch of one step teaches nothing.
+        The last step of a batch only provides the value to bootstrap from.
         """
         losses = super().learn(batch) if batch.shape[1] > 1 else {}
         ends = batch["next"][batch["next", "done"].squeeze(-1)]

@@ -1,7 +1,7 @@
-"""Several seeds as one batch on a GPU: a step of all seeds is one CUDA graph, and their gradient step is another.
+"""Several seeds as one batch on a GPU: all act by one CUDA graph, and take a gradient step by another.
 
-All operations are those of all seeds, so their number does not grow with the seeds. The weights stay stacked between
-two batches, and each agent gets its own after each batch. Each seed draws by counter.
+The number of operations does not grow with the seeds. Weights stay stacked between batches, and agents get theirs after
+each. Each seed draws by counter.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from ctgraph_rl.learn.collect import PREVIOUS_ACTION
 from ctgraph_rl.learn.loop import Learnt
 
 SHARED = ("learn", "gradient_step", "minibatches", "after_update", "one_step", "reward", "advantages")
-"""The members of an agent that act on all seeds at once, or that `CapturedGroup` does not call."""
+"""Members of an agent that act on all seeds at once, or that `CapturedGroup` does not call."""
 
 
 def why_not_captured(agent: Agent) -> str | None:
-    """Return why agents like this one cannot act and learn as one batch on a GPU; None if they can."""
+    """Return why such agents cannot act and learn as one batch on a GPU, if they cannot."""
     learner = learner_of(agent)
     name = type(learner).__name__
     if not isinstance(learner, PolicyGradient) or not learner.capturable:
@@ -48,9 +48,9 @@ def why_not_captured(agent: Agent) -> str | None:
 
 
 class Draws:
-    """What several seeds draw from on a device, the same words on each: by counter, see `ctgraph_rl.core.philox`.
+    """Draws of several seeds on a device, by the counters of `ctgraph_rl.core.philox`.
 
-    The counters stay where they are in memory, so that CUDA graphs advance them.
+    The counters stay in place in memory, so that CUDA graphs advance them.
 
     Args:
         seeds: of each, in [0, 2**63).
@@ -62,7 +62,7 @@ class Draws:
         self.tick = torch.zeros_like(self.seed)
 
     def words(self, count: int) -> Tensor:
-        """Return so many words in [0, 2**32) of each seed, int64 [seeds, count]."""
+        """Return words in [0, 2**32) of each seed, int64 [seeds, count]."""
         block = torch.arange(-(-count // 4), device=self.tick.device)
         row = torch.zeros_like(self.tick)
         words = philox.draw(self.seed, row, self.tick, philox.STREAM_AGENT, block)
@@ -70,18 +70,18 @@ class Draws:
         return torch.stack(words, dim=-1).flatten(1)[:, :count]
 
     def exponential(self, count: int) -> Tensor:
-        """Return so many exponential numbers of each seed, float32 [seeds, count], of 23 bits and never 0."""
+        """Return exponential numbers of each seed, float32 [seeds, count], of 23 bits and never 0."""
         uniform = ((self.words(count) >> 9).to(torch.float32) + 0.5) * 2.0**-23
         return -uniform.log()
 
     def orders(self, count: int) -> Tensor:
-        """Return a random order of so many items for each seed, int64 [seeds, count]."""
+        """Return a random order of items for each seed, int64 [seeds, count]."""
         upper, lower = self.words(2 * count).unflatten(1, (2, count)).unbind(1)
         return (upper << 31 | lower >> 1).argsort(dim=1)
 
 
 class SeedDraws(NamedTuple):
-    """What one of several seeds draws from, with the members of a `torch.Generator` that a checkpoint needs."""
+    """One seed's draws, with the members of a `torch.Generator` that a checkpoint needs."""
 
     tick: Tensor
     """The counter of `Draws`, int64 [1]."""
@@ -99,9 +99,8 @@ class CapturedGroup(SeedGroup):
     """Agents of one configuration with different seeds, which act and learn together on a GPU.
 
     Args:
-        agents: at least one, each as `ctgraph_rl.runs.train.new_agent` returns it; `why_not_captured` has no objection.
-        generators: of each agent, with the state of torch's global generator after the agent was built. Nothing draws
-            from them at a step; they say the seeds.
+        agents: at least one, from `ctgraph_rl.runs.train.new_agent`; `why_not_captured` has no objection.
+        generators: of each agent, with torch's global state after it was built. They only give the seeds.
     """
 
     first: PolicyGradient
@@ -114,16 +113,16 @@ class CapturedGroup(SeedGroup):
         self.device_generators = [SeedDraws(tick) for tick in self.draws.tick]
         self._region = Region(self._usual_update)
         self._words: list[int] = []
-        """What methods draw from at the boundary of a task, a seed of torch's generators for each agent."""
+        """A seed of torch's generators for each agent, from which methods draw at boundaries."""
 
     @property
     def stack(self) -> Stack:
-        """The agents' tensors, from the first step on: a saved state is restored before that."""
+        """The agents' tensors, from the first step on, after a saved state was restored."""
         return self.stacks[0]
 
     @contextmanager
     def random(self, number: int) -> Iterator[None]:
-        """Let torch's global generators be those of one agent, that of the GPU, too."""
+        """Replace torch's global generators, also on the GPU, by one agent's."""
         with super().random(number):
             if self._words:
                 torch.manual_seed(self._words[number])
@@ -144,7 +143,7 @@ class CapturedGroup(SeedGroup):
             self._words = self.draws.words(1).flatten().tolist()
 
     def _task_has_changed(self) -> None:
-        """Read what the start of a task has changed, into the memory of the graphs; a method's graphs are new."""
+        """Read what a task's start changed into the graphs' memory; methods' graphs are new."""
         if self.methods:
             super()._task_has_changed()
             self._region = Region(self._usual_update)
@@ -219,5 +218,4 @@ class CapturedGroup(SeedGroup):
         return self._region.copies(minibatch)
 
     def _usual_update(self, minibatch: Data) -> TensorsByName:
-        """Take the step, compiled where the agents are."""
         return (self.first.compiled_step or update)(self.first, self.stack.state, minibatch)

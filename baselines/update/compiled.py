@@ -9,16 +9,15 @@ from typing import Any
 import torch
 
 MOST_COMPILED = 2**14
-"""Gradient steps of different agents, methods and sizes that a process may compile; the compiler's own limit is 8."""
+"""Gradient steps of different agents, methods and sizes that a process may compile; the compiler allows 8."""
 
 
 @cache
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function of a learner and tensors, compiled once for all learners of equal structure.
 
-    With small networks and minibatches nearly all time is spent between operations; compiled code has no such gaps.
-    The compiler finds by itself whether a learner needs other code than those before: for another agent or method,
-    other settings or sizes of tensors. A learner of the same structure, or the next task, uses what is there.
+    Small networks spend nearly all time between operations, where compiled code has no gaps. The compiler recompiles
+    for another agent, method, setting or size of tensors only.
     """
     torch._dynamo.config.trace_autograd_ops = True  # so that gradients are in the graph; a patch costs 0.07 ms a step
     torch._dynamo.config.recompile_limit = torch._dynamo.config.accumulated_recompile_limit = MOST_COMPILED
@@ -26,5 +25,5 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def compiler_options() -> dict[str, Any]:
-    """Return the compiler's options: between operations there are no checks of sizes and, without a GPU, no Python."""
+    """Return compiler options: no checks of sizes between operations and, without a GPU, no Python."""
     return {"size_asserts": False, "cpp_wrapper": not torch.cuda.is_available()}

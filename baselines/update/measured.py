@@ -11,16 +11,16 @@ from torch import Tensor
 from baselines.parts.networks import TensorsByName
 
 LARGEST_WEIGHT = 1e12
-"""Beyond this a network has diverged, and its outputs soon overflow."""
+"""Beyond this a network has diverged."""
 
 
 def table_of(steps: Sequence[TensorsByName]) -> Tensor:
-    """Return what was measured in gradient steps, [...] each, as a table, [names, gradient steps, ...]."""
+    """Return measurements of gradient steps, [...] each, as a table, [names, gradient steps, ...]."""
     return torch.stack([torch.stack(list(step.values())) for step in steps], dim=1)
 
 
 def finite_means(names: Sequence[str], table: Tensor, largest_weight: Tensor) -> dict[str, float]:
-    """Return the means of a table of measurements, [names, gradient steps].
+    """Return the means of measurements, [names, gradient steps].
 
     Raises:
         FloatingPointError: names the first number that is not finite, or the largest weight.
@@ -33,7 +33,7 @@ def finite_means(names: Sequence[str], table: Tensor, largest_weight: Tensor) ->
 
 
 def require_finite(name: str, value: Tensor, most: float = math.inf) -> None:
-    """Check that a number is finite and at most ``most``.
+    """Require a finite number of at most ``most``.
 
     Raises:
         FloatingPointError: if it is not; names the number.

@@ -1,7 +1,7 @@
-"""Several seeds as one batch: agents of equal structure whose networks act and learn in the same operations.
+"""Several seeds as one batch: agents of equal structure act and learn in the same operations.
 
-Weights are stacked only for forward passes and gradient steps. Between two calls each agent has its own, so saving,
-evaluation and the hooks at task changes are those of a single agent.
+Weights are stacked only for forward passes and gradient steps. Saving, evaluation and hooks at task changes are those
+of single agents.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from ctgraph_rl.agent import Agent
 from ctgraph_rl.learn.loop import Learnt
 
 HOOKS = ("on_batch", "transform_minibatch", "penalties", "transform_gradients", "after_step", "after_learning")
-"""The hooks of a method at a batch, for which the class that sets ``stackable`` vouches."""
+"""Hooks of a method at a batch, for which the class that sets ``stackable`` vouches."""
 
 LARGEST_MINIBATCH = 512
-"""Items of the largest minibatches that are stacked: with larger ones, products of one seed keep a core busy."""
+"""Items of the largest stacked minibatches; larger ones keep a core busy by themselves."""
 
 
 def why_not_together(agent: Agent) -> str | None:
-    """Return why agents like this one cannot act and learn as one batch; None if they can."""
+    """Return why such agents cannot act and learn as one batch, if they cannot."""
     learner = learner_of(agent)
     name = type(learner).__name__
     if not isinstance(learner, Learner) or not learner.stackable:
@@ -47,7 +47,7 @@ def why_not_together(agent: Agent) -> str | None:
 
 
 def why_not_step(learner: Learner) -> str | None:
-    """Return why the steps of a learner's method and optimiser cannot be those of several seeds; None if they can."""
+    """Return why a learner's method and optimiser cannot step several seeds, if they cannot."""
     if not has_stackable(learner.method, HOOKS):
         name = type(learner.method).__name__
         return f"{name} cannot be vectorised over seeds: its hooks take the weights of one seed"
@@ -57,7 +57,7 @@ def why_not_step(learner: Learner) -> str | None:
 
 
 def has_stackable(part: nn.Module, members: Sequence[str]) -> bool:
-    """Return whether a learner or method is ``stackable``, and no member is newer than the class that sets it."""
+    """Return whether a learner or method is ``stackable``, with no member newer than the class that sets it."""
     kind = type(part)
     owner: Any = next(each for each in kind.__mro__ if "stackable" in vars(each))
     return owner.stackable and all(getattr(kind, name, None) is getattr(owner, name, None) for name in members)
@@ -66,11 +66,11 @@ def has_stackable(part: nn.Module, members: Sequence[str]) -> bool:
 class SeedGroup:
     """Agents of one configuration with different seeds, which act and learn together.
 
-    Each draws from its own generator, in the order in which it draws from torch's global one in a run of one seed.
+    Each draws from a separate generator, in the order of a run of one seed.
 
     Args:
-        agents: at least one, each as `ctgraph_rl.runs.train.new_agent` returns it; `why_not_together` has no objection.
-        generators: of each agent, with the state of torch's global generator after the agent was built.
+        agents: at least one, from `ctgraph_rl.runs.train.new_agent`; `why_not_together` has no objection.
+        generators: of each agent, with torch's global state after it was built.
     """
 
     device_generators: Sequence[Any] | None = None
@@ -89,13 +89,13 @@ class SeedGroup:
         self._outputs: Outputs | None = None
 
     def _task_has_changed(self) -> None:
-        """Forget what depends on the task: what a method computes can depend on earlier ones."""
+        """Forget what depends on the task, as methods' computations can."""
         self._stacks = []
         self._acting = self._outputs = None
 
     @contextmanager
     def random(self, number: int) -> Iterator[None]:
-        """Let torch's global generator be that of one agent."""
+        """Replace torch's global generator by one agent's."""
         generator = self.generators[number]
         before = torch.get_rng_state()
         torch.set_rng_state(generator.get_state())
@@ -107,7 +107,7 @@ class SeedGroup:
 
     @property
     def stacks(self) -> list[Stack]:
-        """The learners' tensors, as many learners in each as learn at once."""
+        """The learners' tensors, a stack for those that learn at once."""
         if not self._stacks:
             count = len(self.learners)
             bounds = torch.arange(count, device="cpu").tensor_split(math.ceil(count / self.most_at_once))
@@ -115,14 +115,14 @@ class SeedGroup:
         return self._stacks
 
     def start_task(self, task: int | None = None) -> None:
-        """See `ctgraph_rl.agent.Agent`."""
+        """Start a task of all agents."""
         for number, agent in enumerate(self.agents):
             with self.random(number):
                 agent.start_task(task)
         self._task_has_changed()
 
     def end_task(self) -> None:
-        """See `ctgraph_rl.agent.Agent`."""
+        """End a task of all agents."""
         self._acting = None
         for number, agent in enumerate(self.agents):
             with self.random(number):
@@ -133,7 +133,7 @@ class SeedGroup:
         return value.unflatten(0, (len(self.agents), -1))
 
     def policy(self, data: TensorDictBase) -> TensorDictBase:
-        """Write the actions of all agents, [seeds * num_envs], and what they need to learn from them."""
+        """Write the actions of all agents, [seeds * num_envs], and what learning needs of them."""
         for key, value in self.acted(data).items():
             data.set(key, value.flatten(0, 1))
         return data
@@ -157,9 +157,9 @@ class SeedGroup:
         return {key: torch.stack([each[key] for each in written]) for key in written[0]}
 
     def _act(self, stack: Stack, data: Items) -> TensorsByName:
-        """Compute `Stack.outputs` by a graph of its operations, compiled where the agents set it.
+        """Return `Stack.outputs` by a graph of its operations, compiled where the agents set it.
 
-        Without it most of the time is spent on binding tensors and between operations.
+        Binding tensors and gaps between operations would take most of the time.
         """
         inputs = stack.acting_inputs(data)
         if self._outputs is None:
@@ -168,20 +168,20 @@ class SeedGroup:
         return self._outputs(*inputs)
 
     def _compile(self, graph: GraphModule, inputs: Sequence[Tensor]) -> Outputs:
-        """Compile a graph, or return what was compiled of an equal one."""
+        """Compile a graph, or return that of an equal one."""
         if graph.code not in self._compiled:
             self._compiled[graph.code] = compile(graph, [*inputs], compiler_options())
         return self._compiled[graph.code]
 
     def _sampled(self, outputs: Mapping[str, Tensor]) -> TensorsByName:
-        """Return random actions, each agent's drawn from its generator."""
+        """Return random actions from each agent's generator."""
         noise = torch.empty_like(outputs["log_probs"], memory_format=torch.contiguous_format)
         for row, generator in zip(noise, self.generators, strict=True):
             row.exponential_(generator=generator)
         return sampled(outputs, noise)
 
     def _explored(self, outputs: Mapping[str, Tensor]) -> TensorsByName:
-        """Return the best actions, and where an agent explores random ones."""
+        """Return the best actions, or random ones where an agent explores."""
         actions = outputs["action_value"].argmax(dim=-1)
         for number, (learner, action) in enumerate(zip(self.learners, actions, strict=True)):
             with self.random(number):
@@ -202,7 +202,7 @@ class SeedGroup:
         return measured
 
     def learnt(self, batch: TensorDictBase) -> list[Learnt]:
-        """Learn, and return what `learn` does; an agent that failed keeps weights that are not finite."""
+        """Learn as `learn` does; an agent that failed keeps weights that are not finite."""
         parts = batch.chunk(len(self.agents))
         measured: list[Learnt] = []
         if not self.is_stacked:
@@ -223,7 +223,6 @@ class SeedGroup:
         return measured
 
     def _learn_at_once(self, stack: Stack, numbers: Sequence[int], parts: Sequence[TensorDictBase]) -> list[Learnt]:
-        """Let some of the agents learn as one stack."""
         stack.read()
         minibatches = {number: self.learners[number].minibatches(parts[number]) for number in numbers}
         errors: dict[Learner, FloatingPointError] = {}
@@ -242,7 +241,7 @@ class SeedGroup:
         return [or_error(measured, *pair) for pair in zip(stack.learners, table, strict=True)]
 
     def _next(self, minibatches: Mapping[int, Iterator[Items]]) -> list[Data]:
-        """Return the next minibatch of each of these agents; none after the last."""
+        """Return each agent's next minibatch; none after the last."""
         given = []
         for number, iterator in minibatches.items():
             with self.random(number):
@@ -254,7 +253,7 @@ class SeedGroup:
     def _update(
         self, stack: Stack, minibatches: Sequence[Data], errors: dict[Learner, FloatingPointError]
     ) -> TensorsByName:
-        """Take a gradient step of a stack; return what was measured, [seeds] each, and add to the learners' errors."""
+        """Take a gradient step of a stack; return measurements, [seeds] each, and add to the learners' errors."""
         needs_weights = stack.learners[0].needs_weights
         batch = {key: torch.stack([each[key] for each in minibatches]) for key in minibatches[0]}
         measured = self._step(stack, batch)
@@ -273,7 +272,7 @@ class SeedGroup:
         return {key: value for key, value in measured.items() if value.ndim == 1}
 
     def _step(self, stack: Stack, batch: Items) -> TensorsByName:
-        """Take the gradient step of a stack, compiled for minibatches of the usual size where the agents set it."""
+        """Take a stack's gradient step, compiled for usual minibatches where the agents set it."""
         first = stack.learners[0]
         usual = batch["action"].shape[1] == first.minibatch_size
         function = first.compiled_step if usual and first.compiled_step is not None else update
@@ -281,17 +280,17 @@ class SeedGroup:
 
 
 Outputs = Callable[..., TensorsByName]
-"""A graph of operations on the tensors of a `Stack`, compiled or not, that acts."""
+"""A graph of operations on the tensors of a `Stack` that acts."""
 
 CACHED_BYTES = 2**23
-"""What a core keeps in its cache, of weights, gradients and moments."""
+"""A core's cache, of weights, gradients and moments."""
 
 
 def _gains_from_stacking(learner: Learner) -> bool:
-    """Return whether gradient steps of a stack take less time than those of each learner in turn.
+    """Return whether gradient steps of a stack are faster than those of each learner in turn.
 
-    Graph steps of a stack with penalties or masks take longer: they write tensors of the size of all seeds' weights
-    to memory and read them again, where the compiled step of one learner keeps its own in the cache.
+    With penalties or masks they are slower: they write all seeds' weights to memory, where one learner's stay in the
+    cache.
     """
     method = type(learner.method)
     plain = method.penalties is Hooks.penalties and method.transform_gradients is Hooks.transform_gradients
@@ -300,13 +299,13 @@ def _gains_from_stacking(learner: Learner) -> bool:
 
 
 def _most_at_once(learner: Learner) -> int:
-    """Return how many seeds a compiled step takes: their tensors stay in the cache from one step to the next."""
+    """Return how many seeds' tensors stay in the cache between compiled steps."""
     of_one = sum(4 * parameter.numel() * parameter.element_size() for parameter in learner.weights)
     return max(1, CACHED_BYTES // of_one)
 
 
 def or_error(measure: Callable[..., dict[str, float]], *given: Any) -> Learnt:
-    """Return what a function measures, or its error where that is not finite."""
+    """Return a function's measurements, or its error where they are not finite."""
     try:
         return measure(*given)
     except FloatingPointError as error:
@@ -315,9 +314,9 @@ def or_error(measure: Callable[..., dict[str, float]], *given: Any) -> Learnt:
 
 @torch.no_grad()
 def clear(learner: Learner) -> None:
-    """Set the weights of an agent that has failed to zero, so that it keeps its place in the batch and raises nothing.
+    """Set a failed agent's weights to zero, so that it keeps its place in the batch and raises nothing.
 
-    Without it the others would be a batch of another size, whose products may be rounded otherwise.
+    A batch of another size might round the others' products differently.
     """
     learner.clear_optimiser_state(learner.trainable)
     for parameter in learner.parameters():
@@ -341,5 +340,5 @@ def sampled(outputs: Mapping[str, Tensor], noise: Tensor) -> TensorsByName:
 
 
 def learner_of(agent: Agent) -> Any:
-    """Return the learner that a method changes, or the agent itself."""
+    """Return the learner that a method changes, or the agent."""
     return agent.agent if isinstance(agent, AgentWithMethod) else agent

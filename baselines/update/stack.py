@@ -1,4 +1,4 @@
-"""Tensors of several learners of equal structure, stacked: one forward pass and one update for all of them."""
+"""Stacked tensors of learners of equal structure: one forward pass and one update for all."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from baselines.update.update import Parts, UpdateState, over_seeds, parts_of, st
 
 
 def named_tensors(learner: Learner) -> TensorsByName:
-    """Return a learner's parameters and buffers by name, without other weights, in an order of its structure."""
+    """Return a learner's parameters and buffers by name, without other weights, in the order of its structure."""
     others = {id(value) for value in learner.other_weights().values()}
     found = {}
     for path, module in learner.named_modules():
@@ -27,7 +27,7 @@ def named_tensors(learner: Learner) -> TensorsByName:
 
 
 class Stack:
-    """The tensors of several learners, [seeds, ...] each, which stay where they are in memory.
+    """The tensors of several learners, [seeds, ...] each, which stay in place in memory.
 
     Args:
         learners: whose tensors are read at construction and by `read`, and written by `write`.
@@ -39,7 +39,7 @@ class Stack:
         names: dict[int, str] = {}
         turned = []
         self.first_name: dict[str, str] = {}
-        """For each name the first one of the same tensor."""
+        """The first name of each tensor by all of its names."""
 
         for name, tensor in named_tensors(first).items():
             self.first_name[name] = names.setdefault(id(tensor), name)
@@ -80,7 +80,7 @@ class Stack:
 
     @torch.no_grad()
     def write(self) -> None:
-        """Write what a step changes to the learners: weights, buffers of methods, the optimiser's state."""
+        """Write a step's changes to the learners: weights, buffers of methods, the optimiser's state."""
         members = [named_tensors(learner) for learner in self.learners]
         for name in self.written:
             value = self.kept[name]
@@ -115,15 +115,15 @@ class Stack:
         return {name: kept[first] for name, first in self.first_name.items()}
 
     def outputs(self, data: Items) -> TensorsByName:
-        """Compute the outputs of all networks for one step of all rows, [seeds, num_envs, n] each."""
+        """Return the outputs of all networks for one step of all rows, [seeds, num_envs, n] each."""
         return over_seeds(self.learners[0], _outputs, self.state, data)
 
     def one_step(self, data: Items) -> Items:
-        """Compute `Learner.one_step` of all learners, [seeds, num_envs, ...] each."""
+        """Return `Learner.one_step` of all learners, [seeds, num_envs, ...] each."""
         return over_seeds(self.learners[0], lambda learner, weights, data: learner.one_step(data), self.state, data)
 
     def acting_inputs(self, data: Items) -> list[Tensor]:
-        """Return the tensors that `outputs` reads, in one order."""
+        """Return the tensors that `outputs` reads, in a fixed order."""
         return [*(tensor.detach() for tensor in self.kept.values()), *data.values()]
 
     def traced_outputs(self, data: Items) -> GraphModule:
@@ -139,7 +139,7 @@ class Stack:
 
 
 def _keep(kept: TensorsByName, name: str, value: Tensor) -> None:
-    """Write a value into the tensor of a name, which the first call makes."""
+    """Write a value into a named tensor, which the first call makes."""
     if name in kept:
         kept[name].copy_(value)
     else:

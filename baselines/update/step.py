@@ -1,4 +1,4 @@
-"""A gradient step of one learner: run as `update` is written, compiled, or on a GPU replayed as a CUDA graph."""
+"""A gradient step of one learner: `update` as written, compiled, or replayed as a CUDA graph."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ctgraph_rl.core.region import Region, captures
 
 
 def take_step(learner: Trained, batch: Data) -> TensorsByName:
-    """Take a step, the first one and those of other sizes of minibatches as `update` is written."""
+    """Take a step; the first one and unusual sizes run `update` as written."""
     if len(batch["action"]) != learner.minibatch_size or not learner.optimiser.state:
         return update(learner, update_state(learner), batch)
     if not is_captured(learner):
@@ -34,5 +34,5 @@ def update_state(learner: Trained) -> UpdateState:
 
 
 def is_captured(learner: Trained) -> bool:
-    """Return whether steps are captured as a CUDA graph: on GPUs, without a method."""
+    """Return whether steps are CUDA graphs: on GPUs, without a method."""
     return learner.capturable and type(learner.method) is Hooks and captures(next(learner.parameters()).device)

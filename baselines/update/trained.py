@@ -1,4 +1,4 @@
-"""What updates, methods and checkpoints need of a learner: losses, weights and the state of its optimiser."""
+"""What updates, methods and checkpoints need of a learner: losses, weights and optimiser state."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from ctgraph_rl.core.region import Region
 
 
 class Trained(nn.Module):
-    """A module with losses and an optimiser; `baselines.parts.learner.Learner` derives from it."""
+    """A module with losses and an optimiser, the base of `baselines.parts.learner.Learner`."""
 
     policy: TensorDictModuleBase
     optimiser: torch.optim.Optimizer
     max_grad_norm: float
 
     minibatch_size: int
-    """Items of a minibatch, unless the end of a block has shortened the batch."""
+    """Items of a minibatch, unless a block's end shortened the batch."""
 
     capturable: ClassVar[bool] = False
-    """Whether a gradient step has no branch on data and keeps no new tensors, so that a CUDA graph can replay it."""
+    """Whether a gradient step has no branch on data and keeps no new tensors, as CUDA graphs need."""
 
     compiled_step: Callable[..., TensorsByName] | None = None
     """`baselines.update.update.update`, compiled."""
@@ -41,45 +41,45 @@ class Trained(nn.Module):
         self._takes_others = "others" in signature(self.loss).parameters
 
     def loss(self, batch: Data) -> TensorsByName:
-        """Compute the losses of a batch; see `ctgraph_rl.agent.Agent`."""
+        """Return the losses of a batch, as `ctgraph_rl.agent.Agent`."""
         raise NotImplementedError
 
     def losses(self, batch: Data, weights: Sequence[Tensor], others: Data) -> TensorsByName:
-        """Compute the agent's losses and the method's penalties.
+        """Return the agent's losses and the method's penalties.
 
         Args:
             batch: a minibatch.
-            weights: by which the sum is differentiated; the networks have them.
-            others: as `other_weights` returns them, for a ``loss`` with an argument of this name.
+            weights: of the networks, by which the sum is differentiated.
+            others: from `other_weights`, for a ``loss`` with an argument of this name.
         """
         own = self.loss(batch, others) if self._takes_others else self.loss(batch)  # type: ignore[call-arg]
         return {**own, **self.method.penalties(batch, weights)}
 
     def other_weights(self) -> TensorsByName:
-        """Return what the losses read in place of the learner's own tensors, by their names: a target network's."""
+        """Return the tensors that losses read in place of the learner's, by name: a target network's."""
         return {}
 
     def with_others(self, others: Data | None, function: Callable[..., Any], *given: Any) -> Any:
-        """Return a function of this learner with other tensors, by name; None: those of `other_weights`."""
+        """Return a function of this learner with other tensors by name; None: those of `other_weights`."""
         found = self.other_weights() if others is None else others
         return functional_call(self, dict(found), (function, *given), tie_weights=False)
 
     def forward(self, function: Callable[..., Any], *given: Any) -> Any:
-        """Return a function of this learner: with the tensors that `torch.func.functional_call` gives it."""
+        """Return a function of this learner with the tensors of `torch.func.functional_call`."""
         return function(self, *given)
 
     @property
     def weights(self) -> list[nn.Parameter]:
-        """The parameters by which the losses are differentiated: what the optimiser trains without a method."""
+        """The parameters by which losses are differentiated, which the optimiser trains without a method."""
         return self.method.network_weights(self.trainable)
 
     @property
     def trainable(self) -> list[nn.Parameter]:
-        """The optimiser's parameters: the weights, unless a method trains others in their place."""
+        """The optimiser's parameters: the weights, unless a method trains others."""
         return self.optimiser.param_groups[0]["params"]
 
     def replace_optimiser(self, parameters: Sequence[nn.Parameter]) -> None:
-        """Replace the optimiser by a new one of the same kind for these parameters."""
+        """Replace the optimiser by a new one of its kind for these parameters."""
         self.optimiser = type(self.optimiser)(parameters, **self.optimiser.defaults)
         self.region = None
 
@@ -90,11 +90,11 @@ class Trained(nn.Module):
                 value.zero_()
 
     def reset_parameters(self) -> None:
-        """Draw all weights again as at construction; layers need ``reset_parameters``."""
+        """Draw all weights as at construction; layers need ``reset_parameters``."""
         self.policy.apply(reset_layer)
 
     def weights_changed(self) -> None:
-        """Called after weights were changed other than by learning; nothing else depends on them."""
+        """Called after weights were changed other than by learning."""
 
     @override
     def get_extra_state(self) -> NamedValues:
@@ -110,6 +110,6 @@ class Trained(nn.Module):
 
 
 def reset_layer(module: nn.Module) -> None:
-    """Draw the weights of a layer, if it has any, as PyTorch does at its construction."""
+    """Draw a layer's weights, if any, as PyTorch does at construction."""
     if list(module.parameters(recurse=False)):
         module.reset_parameters()  # type: ignore[operator]

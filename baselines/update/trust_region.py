@@ -1,4 +1,4 @@
-"""A step of TRPO (Schulman et al. 2015, arXiv 1502.05477) for policies of discrete actions, in plain tensors."""
+"""A step of TRPO (Schulman et al. 2015, arXiv 1502.05477) for discrete actions, in plain tensors."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ def trust_region_step(
     weight: Tensor,
     max_kl: float,
 ) -> dict[str, Tensor]:
-    """Minimise a loss within a trust region, in place: the largest of some steps that lower it and keep to ``max_kl``.
+    """Minimise a loss within a trust region, in place: the largest of some steps that lower it within ``max_kl``.
 
     The direction solves F x = -g by conjugate gradients, where F is the Hessian of the mean divergence from the present
-    policy. There it is the Gauss-Newton matrix J' (diag(p) - p p') J of the logits' Jacobian J, exactly.
+    policy. There it is exactly the Gauss-Newton matrix J' (diag(p) - p p') J of the logits' Jacobian J.
 
     Args:
         weights: what is changed, with names.
@@ -75,7 +75,7 @@ def trust_region_step(
 
 
 def kl_divergence(logits: Tensor, others: Tensor) -> Tensor:
-    """Compute the divergence of categorical distributions from others, [...], from logits [..., num_actions]."""
+    """Return the divergence of categorical distributions from others, [...], from logits [..., num_actions]."""
     log_chances = logits.log_softmax(dim=-1)
     return (log_chances.exp() * (log_chances - others.log_softmax(dim=-1))).sum(dim=-1)
 

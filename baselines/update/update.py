@@ -1,6 +1,6 @@
-"""One update: weights, what losses read beside them, optimiser state and a batch to new weights and measurements.
+"""One update: from weights, other tensors, optimiser state and a batch to new weights and measurements.
 
-Optimisers are PyTorch's own Adam and RMSprop; their step is a function of tensors, for every executor.
+The step of PyTorch's Adam and RMSprop is a function of tensors, for every executor.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ctgraph_rl.core.dynamics import beside
 OPTIMISERS = ("adam", "rmsprop")
 
 MOMENTS = {torch.optim.Adam: ("exp_avg", "exp_avg_sq"), torch.optim.RMSprop: ("square_avg",)}
-"""What an optimiser keeps of each parameter beside the number of its steps."""
+"""What an optimiser keeps of each parameter beside its step count."""
 
 
 def make_optimiser(name: str, parameters: Iterable[nn.Parameter], learning_rate: float) -> torch.optim.Optimizer:
@@ -34,18 +34,18 @@ def make_optimiser(name: str, parameters: Iterable[nn.Parameter], learning_rate:
 class Parts(NamedTuple):
     """What a step of Adam or RMSprop reads and updates.
 
-    Compiled code that read the optimiser itself would be bound to that one; by its parts it serves all of its kind.
+    Compiled code that read the optimiser would be bound to it; by its parts it serves all of its kind.
     """
 
     is_adam: bool
     settings: dict[str, Any]
     parameters: list[Tensor]
     state: list[TensorsByName]
-    """Of each parameter: the optimiser's own, so a state dict is the same as after ``optimiser.step()``."""
+    """The optimiser's state of each parameter, so a state dict is that after ``optimiser.step()``."""
 
 
 class UpdateState(NamedTuple):
-    """What an update reads and writes in place: the tensors of one learner, or those of several seeds."""
+    """What an update reads and writes in place: tensors of one learner, or of several seeds."""
 
     weights: Sequence[Tensor]
     """By which the losses are differentiated."""
@@ -53,17 +53,16 @@ class UpdateState(NamedTuple):
     optimiser: Parts | torch.optim.Optimizer
 
     tensors: Mapping[str, Tensor] | None = None
-    """Of several seeds all parameters and buffers by name, [seeds, ...] each; None: those that one learner has."""
+    """Of several seeds, all parameters and buffers by name, [seeds, ...] each; None: the learner's."""
 
     names: Sequence[str] = ()
-    """Those of the weights among these tensors."""
+    """Names of the weights among these tensors."""
 
     turned: Sequence[str] = ()
-    """The names of matrices, which are kept as [seeds, inputs, outputs]: so their gradients come out of the backward
-    pass."""
+    """Names of matrices kept as [seeds, inputs, outputs], as the backward pass returns their gradients."""
 
     others: Mapping[str, Tensor] = {}
-    """What `Trained.other_weights` returns, of several seeds [seeds, ...] each."""
+    """From `Trained.other_weights`, of several seeds [seeds, ...] each."""
 
 
 Update = Callable[[Trained, UpdateState, Data], TensorsByName]
@@ -72,12 +71,12 @@ Update = Callable[[Trained, UpdateState, Data], TensorsByName]
 def update(learner: Trained, state: UpdateState, batch: Data) -> TensorsByName:
     """Minimise the sum of the losses of a batch by one step; return losses and gradient norm.
 
-    It has no branch on data and depends only on its arguments. With several seeds these are minibatches [seeds, items,
-    ...], and results are [seeds].
+    It has no branch on data and depends only on its arguments. With several seeds minibatches are [seeds, items, ...]
+    and results [seeds].
 
     Args:
-        learner: whose losses and method are meant; with several seeds any of them.
-        state: is changed in place.
+        learner: gives losses and method; with several seeds any of them.
+        state: changed in place.
         batch: a minibatch.
     """
     losses = losses_of(learner, state, batch)
@@ -88,14 +87,14 @@ def update(learner: Trained, state: UpdateState, batch: Data) -> TensorsByName:
 
 
 def losses_of(learner: Trained, state: UpdateState, batch: Data) -> TensorsByName:
-    """Compute the agent's losses and the method's penalties, of each seed where there are several."""
+    """Return the agent's losses and the method's penalties, of each seed if there are several."""
     if state.tensors is None:
         return learner.losses(batch, state.weights, state.others)
     return over_seeds(learner, _losses, state, batch, state.others)
 
 
 def over_seeds(learner: Trained, function: Callable[..., Any], state: UpdateState, *given: Any) -> Any:
-    """Compute a function of a learner, its weights and further tensors for each seed."""
+    """Return a function of a learner, its weights and further tensors for each seed."""
 
     def of_one(tensors: TensorsByName, *its: Any) -> Any:
         return _with(learner, tensors, function, state, *its)
@@ -104,7 +103,7 @@ def over_seeds(learner: Trained, function: Callable[..., Any], state: UpdateStat
 
 
 def with_tensors(learner: Trained, state: UpdateState, function: Callable[..., Any], *given: Any) -> Any:
-    """Compute a function of a learner that has the tensors of a state, those of all seeds at once, and its weights."""
+    """Return a function of a learner with a state's tensors, those of all seeds at once, and its weights."""
     if state.tensors is None:
         return function(learner, state.weights, *given)
     return _with(learner, _seen(state), function, state, *given)
@@ -122,13 +121,13 @@ def _losses(learner: Trained, weights: Sequence[Tensor], batch: Data, others: Da
 
 
 def _seen(state: UpdateState) -> TensorsByName:
-    """Return the tensors of several seeds as the networks see them."""
+    """Return several seeds' tensors as the networks see them."""
     tensors = state.tensors or {}
     return {name: value.mT if name in state.turned else value for name, value in tensors.items()}
 
 
 def _descend(learner: Trained, weights: Sequence[Tensor], state: UpdateState, gradients: Sequence[Tensor]) -> Tensor:
-    """Take the optimiser's step; return the norm of the gradients, of each seed where there are several."""
+    """Take the optimiser's step; return the gradients' norm, of each seed if there are several."""
     is_stacked = state.tensors is not None
     if is_stacked:
         gradients = [unstacked(gradient) for gradient in gradients]
@@ -165,7 +164,7 @@ def _after_step(learner: Trained, weights: Sequence[Tensor]) -> tuple[()]:
 
 
 def norm_of(gradients: Sequence[Tensor], num_leading: int = 0) -> Tensor:
-    """Return the norm of all gradients, of each of the leading dimensions; compiled in a form that fuses."""
+    """Return the norm of all gradients for each of the leading dimensions, in a form that fuses."""
     parts = [gradient.unsqueeze(-1) if gradient.ndim == num_leading else gradient for gradient in gradients]
     if torch.compiler.is_compiling():
         squares = [part.square().sum(dim=tuple(range(num_leading, part.ndim))) for part in parts]
@@ -175,7 +174,7 @@ def norm_of(gradients: Sequence[Tensor], num_leading: int = 0) -> Tensor:
 
 
 def total_loss(losses: Mapping[str, Tensor]) -> Tensor:
-    """Return the sum of the losses named ``loss_*``, which is what is minimised."""
+    """Return the sum of the losses named ``loss_*``, which is minimised."""
     return sum(
         (value for key, value in losses.items() if key.startswith("loss_")),
         start=torch.zeros((), dtype=torch.float32, device="cpu"),
@@ -188,19 +187,19 @@ def stacked(tensors: Sequence[Tensor]) -> Tensor:
 
 
 def unstacked(tensor: Tensor) -> Tensor:
-    """Return the parameters of several seeds without a copy, [seeds, ...]: a view of what `stacked` returned."""
+    """Return the parameters of several seeds, [seeds, ...], as a view of a result of `stacked`."""
     return tensor.mT if tensor.ndim == 3 else tensor
 
 
 def has_parts(optimiser: torch.optim.Optimizer) -> bool:
-    """Return whether an optimiser is one of which `Parts` say all: Adam or RMSprop in their usual form."""
+    """Return whether an optimiser is Adam or RMSprop in its usual form."""
     [group, *others] = optimiser.param_groups
     unusual = any(group.get(key) for key in ("amsgrad", "momentum", "centered", "differentiable"))
     return type(optimiser) in MOMENTS and not others and not unusual
 
 
 def parts_of(optimiser: torch.optim.Optimizer) -> Parts | torch.optim.Optimizer:
-    """Return the parts of an optimiser, which has its state from then on; of another kind the optimiser itself."""
+    """Return the parts of an optimiser, which has its state from then on; of another kind the optimiser."""
     if not has_parts(optimiser):
         return optimiser
     [group] = optimiser.param_groups
@@ -211,7 +210,7 @@ def parts_of(optimiser: torch.optim.Optimizer) -> Parts | torch.optim.Optimizer:
 
 
 def _prepare_state(optimiser: torch.optim.Optimizer, parameter: Tensor, fused: bool) -> TensorsByName:
-    """Return the state of a parameter, as PyTorch makes it; on a GPU the number of steps is there for CUDA graphs."""
+    """Return a parameter's state, as PyTorch makes it; on a GPU with the step count there for CUDA graphs."""
     state = optimiser.state[parameter]
     if not state:
         device = parameter.device if fused or parameter.is_cuda else "cpu"
@@ -231,7 +230,7 @@ def minimise(optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
 
 
 def step(optimiser: Parts | torch.optim.Optimizer, gradients: Sequence[Tensor]) -> None:
-    """Update an optimiser's parameters and state in place; one that has no `Parts` takes a step by itself."""
+    """Update an optimiser's parameters and state in place; without `Parts` it takes a step itself."""
     if not isinstance(optimiser, Parts):
         for parameter, gradient in zip(optimiser.param_groups[0]["params"], gradients, strict=True):
             parameter.grad = gradient
