@@ -1,4 +1,4 @@
-"""The devices of this machine, and the dtype and device that torch takes where none is named."""
+"""The devices of this machine, and torch's default dtype and device."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from ctgraph_rl.checks import require
 
 
 def checked_device(device: object) -> torch.device:
-    """Return the torch device that a name, or a `torch.device`, stands for.
+    """Return the torch device of a name or `torch.device`.
 
     Raises:
-        ValueError: if there is no such device on this machine; lists the choices.
+        ValueError: if this machine has no such device; lists the choices.
     """
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     choices = ["cpu", *(["cuda"] if count else []), *(f"cuda:{i}" for i in range(count))]
@@ -29,7 +29,7 @@ def checked_device(device: object) -> torch.device:
 
 @contextmanager
 def torchs_defaults() -> Iterator[None]:
-    """Let code of others that names no dtype and no device have float32 and the CPU, whatever the user's defaults."""
+    """Give others' code that names no dtype and device float32 and the CPU, whatever the user's defaults."""
     dtype = torch.get_default_dtype()
     if dtype == torch.float32 and torch.get_default_device().type == "cpu":
         yield

@@ -1,9 +1,7 @@
 """The tensor engine: pure functions, without TorchRL, that every face of the environment wraps.
 
-In the order of the paper: transition, observation, reward, episode. Which state of the tree an action leads to is in
-`ctgraph_rl.core.tree`, what an image undergoes when it is read in `reading`. The C kernel has the same bits.
-
-Shapes: N rows; every tensor is [N] unless said otherwise. All that is random is drawn by counter, see `philox`.
+In the order of the paper: transition, observation, reward, episode. The C kernel has the same bits. Shapes: N rows;
+every tensor is [N] unless said otherwise. All random numbers are drawn by counter, in `philox`.
 """
 
 from __future__ import annotations
@@ -70,29 +68,30 @@ Batch = TypeVar("Batch", RowState, Shown)
 
 
 def beside(rows: Tensor, value: Tensor) -> Tensor:
-    """Return a number of each row, [N] or [N, 1], in the form that broadcasts with a value, [N, ...]."""
+    """Return each row's number, [N] or [N, 1], in a form that broadcasts with a value, [N, ...]."""
     return rows.view(-1, *[1] * (value.ndim - 1))
 
 
 def choose(mask: Tensor, new: Batch, old: Batch) -> Batch:
-    """Return one value in the rows of a mask, bool [N], and another value in the others."""
+    """Return one value in the rows of a mask, bool [N], and another elsewhere."""
     pairs = zip(new, old, strict=True)
     return type(new)(*(torch.where(beside(mask, a), a, b) for a, b in pairs))
 
 
 OUTCOME_RUNNING, OUTCOME_FAIL, OUTCOME_OTHER_END, OUTCOME_GOAL = range(4)
-"""Values of ``("next", "outcome")``. Success means `OUTCOME_GOAL`, never a reward threshold."""
+"""Values of ``("next", "outcome")``; success means `OUTCOME_GOAL`."""
 
 NO_LEAF = -1
-"""Value of ``("next", "leaf")`` for a row that has not arrived at an end state."""
+"""Value of ``("next", "leaf")`` for a row not at an end state."""
 
 Words = tuple[Tensor, ...]
-"""The small draws of a tick: two for a wait that begins there, one for the id and one for the view that are shown
-there, and, where rewards have noise, a normal number for the reward of the step that begins there."""
+"""A tick's small draws: two for a wait that begins there, one each for the id and view shown there, and, where rewards
+have noise, a normal number for the step that begins there.
+"""
 
 
 def words_of(tick: Tensor, params: RowParams, uses: Uses) -> Words:
-    """Return the small draws of a tick, of its shape; zeros without use."""
+    """Return the small draws of a tick; zeros without use."""
     words = draw(params.seed, params.row, tick, STREAM_STEP) if uses.draws else (torch.zeros_like(tick),) * 4
     if not uses.reward_noise:
         return words
@@ -105,14 +104,11 @@ def words_of(tick: Tensor, params: RowParams, uses: Uses) -> Words:
 def step(
     state: RowState, action: Tensor, params: RowParams, uses: Uses, words: tuple[Words, Words] | None = None
 ) -> StateAndShown:
-    """Take a step in every row: a pure function, under ``torch.vmap`` and ``torch.compile`` too.
+    """Take a step in every row, also under ``torch.vmap`` and ``torch.compile``.
 
     Args:
-        state: the rows' states.
-        action: int64, see `transition`.
-        params: the rows' tasks.
-        uses: what the rows have use for.
-        words: the draws of the present and of the next tick, if they are at hand.
+        action: int64, as in `transition`.
+        words: draws of the present and the next tick, if at hand.
 
     Returns:
         The next states, with the step's reward, and what they show.
@@ -125,7 +121,7 @@ def step(
 def advance(
     state: RowState, action: Tensor, words: Words, params: RowParams, uses: Uses, absorbing: bool = True
 ) -> RowState:
-    """Return the next states, with the step's reward; the step without what it shows. Words are of the present tick."""
+    """Return the next states with the step's reward, but not what they show. ``words`` are of the present tick."""
     stay = stays(words, params.tree) if uses.waits else None
     after = transition(State(state.state_type, state.node), action, stay, params.tree)
     entered = after.state_type != state.state_type if absorbing else None
@@ -151,7 +147,7 @@ def step_or_reset(
     uses: Uses,
     words: tuple[Words, Words] | None = None,
 ) -> StateAndShown:
-    """Start an episode in the rows of a mask, whatever their action, and step the others; else as `step`."""
+    """Start an episode in the rows of a mask, whatever their action, and `step` the others."""
     now, then = words or (words_of(tick, params, uses) for tick in (state.tick, state.tick + 1))
     stepped = advance(state, action, now, params, uses)
     state = begin(stepped._replace(tick=state.tick + ~mask), mask, params, uses)
@@ -162,22 +158,16 @@ def step_or_reset(
 
 
 def observe(state: RowState, words: Words, params: RowParams, uses: Uses) -> Tensor:
-    """Return the images that rows show: a random view of the id, with noise, late rotation and reward cue.
+    """Return the images that rows show, uint8 [N, *shape]: a random view of the id, with noise, late rotation and
+    reward cue.
 
-    Args:
-        state: the rows' states.
-        words: the small draws of the states' ticks.
-        params: the rows' tasks.
-        uses: what the rows have use for.
-
-    Returns:
-        uint8 [N, *shape].
+    ``words`` are the small draws of the states' ticks.
     """
     return read(look(state, words, params, uses), state, params, uses)
 
 
 class SeenState(NamedTuple):
-    """The views that rows see, not yet read from the bank; int64."""
+    """The views that rows see, not yet read; int64."""
 
     rows: Tensor  # of the bank
     angle: Tensor  # degrees by which the images are still to be rotated
@@ -185,7 +175,7 @@ class SeenState(NamedTuple):
 
 
 def look(state: RowState, words: Words, params: RowParams, uses: Uses) -> SeenState:
-    """Choose each row's view, and draw what is not in the bank; arguments as above."""
+    """Choose each row's view, and draw what is not in the bank."""
     x = params.x
     rows = bank_rows(state, words[2], params.x, uses)
     angle = noise = torch.zeros_like(rows)
@@ -200,7 +190,7 @@ def look(state: RowState, words: Words, params: RowParams, uses: Uses) -> SeenSt
 
 
 def bank_rows(state: State | RowState, word: Tensor, x: ObservationParams, uses: Uses) -> Tensor:
-    """X: return the first view in the bank of the id that a state shows, by its node or drawn with a word."""
+    """X: return the bank's first view of a state's id, by node or drawn."""
     kind = state.state_type.long() if x.first_kind is None else x.first_kind + state.state_type
     rows = x.first_view.index_select(0, kind)
     if uses.unique_ids:
@@ -215,7 +205,7 @@ def bank_rows(state: State | RowState, word: Tensor, x: ObservationParams, uses:
 
 
 def read(seen: SeenState, state: RowState, params: RowParams, uses: Uses) -> Tensor:
-    """Return the images of what is seen: from the bank, with noise, late rotation and reward cue; uint8 [N, *shape]."""
+    """Return the seen images, uint8 [N, *shape], with noise, late rotation and reward cue."""
     x = params.x
     images = params.bank.index_select(0, seen.rows)
     if uses.noise_bank:
@@ -237,7 +227,7 @@ def observation_id(state: RowState, params: RowParams, uses: Uses) -> Tensor:
 
 
 def show(state: RowState, params: RowParams, uses: Uses, words: Words | None = None) -> Shown:
-    """Return what rows show in given states; a pure function like `step`."""
+    """Return what rows show in given states."""
     done = is_done(state, params.tree)
     words = words_of(state.tick, params, uses) if words is None else words
     return Shown(observe(state, words, params, uses), *outcome(state, done, params), done)
@@ -249,7 +239,7 @@ def show(state: RowState, params: RowParams, uses: Uses, words: Words | None = N
 def _paid(
     after: State, entered: Tensor | None, goal_leaf: Tensor, words: Words, params: RowParams, uses: Uses
 ) -> Tensor:
-    """float32: what is paid on entering an end or a fail state.
+    """float32: what entering an end or fail state pays.
 
     Sums are of float32 numbers and their products in float64, hence exact: fused multiply-add changes nothing.
     """
@@ -268,7 +258,7 @@ def _paid(
 
 
 def _share(after: State, goal_leaf: Tensor, params: RowParams, uses: Uses) -> Tensor:
-    """float32: the reward functions' shares, as if every row were at an end state."""
+    """float32: the rewards' shares, as if every row were at an end state."""
     tree = params.tree
     g = params.g
     arrival = Arrival(after.node - tree.first_leaf, goal_leaf, tree.branching_factor, g.depth, uses.max_depth)
@@ -282,17 +272,14 @@ def _share(after: State, goal_leaf: Tensor, params: RowParams, uses: Uses) -> Te
 
 
 def reset(state: RowState, mask: Tensor, params: RowParams, uses: Uses, words: Words | None = None) -> StateAndShown:
-    """Start an episode in the rows of a mask; a pure function like `step`.
+    """Start an episode in the rows of a mask.
 
     Args:
-        state: the rows' states.
         mask: bool, the rows that start an episode; the others stay unchanged.
-        params: the rows' tasks.
-        uses: what the rows have use for.
-        words: the draws of the ticks after the reset, if they are at hand.
+        words: draws of the ticks after the reset, if at hand.
 
     Returns:
-        The states, and what all rows show (the others show what they showed before).
+        The states, and what all rows show; the others show the same as before.
     """
     state = begin(state, mask, params, uses)
     return state, show(state, params, uses, words)
@@ -301,14 +288,14 @@ def reset(state: RowState, mask: Tensor, params: RowParams, uses: Uses, words: W
 def restart(
     state: RowState, mask: Tensor | None, params: RowParams, uses: Uses, words: Words | None = None
 ) -> tuple[RowState, Tensor]:
-    """`reset` that leaves no row finished: return only the states and the observations."""
+    """`reset` that leaves no row finished: return the states and the observations."""
     state = begin(state, mask, params, uses)
     words = words_of(state.tick, params, uses) if words is None else words
     return state, observe(state, words, params, uses)
 
 
 def begin(state: RowState, mask: Tensor | None, params: RowParams, uses: Uses) -> RowState:
-    """Return the states after a reset of the rows of a mask, or of all."""
+    """Return the states after a reset of a mask's rows, or of all."""
     if mask is None:
         zeros = RowState(*map(torch.zeros_like, state))
         state = zeros._replace(tick=state.tick + 1, goal_leaf=state.goal_leaf, episodes_left=state.episodes_left)
@@ -335,7 +322,7 @@ def _cleared(state: RowState, mask: Tensor, uses: Uses) -> RowState:
 
 
 def _count_episode(state: RowState, mask: Tensor, params: RowParams) -> RowState:
-    """Begin an episode: where the last one with a goal is over, draw a goal and how many episodes it lasts."""
+    """Begin an episode; after a goal's last one, draw a goal and its number of episodes."""
     g = params.g
     left = state.episodes_left
     words = draw(params.seed, params.row, state.tick, STREAM_GOAL)
@@ -349,13 +336,13 @@ def _count_episode(state: RowState, mask: Tensor, params: RowParams) -> RowState
 
 
 def outcome(state: RowState, done: Tensor, params: RowParams) -> tuple[Tensor, Tensor]:
-    """Return the ``OUTCOME_*`` of rows, uint8, and the end state that they arrived at, int64, else `NO_LEAF`."""
+    """Return the rows' ``OUTCOME_*``, uint8, and the end state of arrival, int64, else `NO_LEAF`."""
     result, arrived, leaf = arrivals(state, done, params)
     return result, leaf.masked_fill(~arrived, NO_LEAF)
 
 
 def arrivals(state: RowState, done: Tensor, params: RowParams) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the ``OUTCOME_*`` of rows, uint8, whether they arrived at an end state, and if so at which."""
+    """Return the rows' ``OUTCOME_*``, uint8, whether they arrived at an end state, and which."""
     arrived = done & (state.state_type != _FAIL)
     leaf = state.node - params.tree.first_leaf
     hits = arrived & (leaf == state.goal_leaf)

@@ -1,6 +1,6 @@
-"""The shape of a CT-graph and what is known about it in closed form.
+"""The shape of a CT-graph and its closed forms.
 
-Soltoggio et al. 2023 (arXiv 2302.10887), section 2, with its misprints corrected: see ``docs/explanation/errata.md``.
+Soltoggio et al. 2023 (arXiv 2302.10887), section 2; ``docs/explanation/errata.md`` corrects its misprints.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ class CTGraph:
     """A b-ary tree of decision states with a wait state before every decision and end state.
 
     Args:
-        branching_factor: b >= 2, the number of decisions at a decision state.
-        depth: d >= 1, the number of decisions on the way to an end state.
-        wait_prob: p in [0, 1), the probability to stay in a wait state when waiting.
+        branching_factor: b >= 2, decisions at a decision state.
+        depth: d >= 1, decisions on the way to an end state.
+        wait_prob: p in [0, 1), the probability to stay when waiting.
 
     Raises:
-        ValueError: for values out of range and for a tree whose states do not fit int64.
+        ValueError: for values out of range, and trees whose states do not fit int64.
 
     Example:
         >>> graph = CTGraph(branching_factor=2, depth=2, wait_prob=0.5)
@@ -72,17 +72,17 @@ class CTGraph:
 
     @property
     def num_end_states(self) -> int:
-        """b^d end states, the leaves."""
+        """b^d, the leaves."""
         return self.branching_factor**self.depth
 
     @property
     def num_decision_states(self) -> int:
-        """1 + b + ... + b^(d-1) decision states."""
+        """1 + b + ... + b^(d-1)."""
         return self.first_node(self.depth)
 
     @property
     def num_wait_states(self) -> int:
-        """One wait state before each decision and each end state."""
+        """One before each decision and end state."""
         return self.num_decision_states + self.num_end_states
 
     @property
@@ -96,11 +96,11 @@ class CTGraph:
         return (self.branching_factor**level - 1) // (self.branching_factor - 1)
 
     def parent(self, node: int) -> int:
-        """Return the node that ``node``, any but the root 0, is a branch of."""
+        """Return the parent of ``node`` > 0."""
         return (node - 1) // self.branching_factor
 
     def decision(self, node: int) -> int:
-        """Return the decision, in 1..b, that leads from its parent to ``node``, any but the root 0."""
+        """Return the decision, in 1..b, from the parent of ``node`` > 0."""
         return (node - 1) % self.branching_factor + 1
 
     @takes_numbers
@@ -113,12 +113,12 @@ class CTGraph:
 
     @takes_numbers
     def path(self, node: int) -> tuple[int, ...]:
-        """Return the decisions, in 1..b, that lead from the root to ``node``: its goal, if it is an end state."""
+        """Return the decisions, in 1..b, from the root to ``node``: its goal, if it is an end state."""
         return tuple(map(self.decision, self.nodes_to(node)[1:]))
 
     @takes_numbers
     def node_at(self, path: Iterable[int]) -> int:
-        """Return the node that the decisions of ``path`` lead to from the root."""
+        """Return the node that decisions lead to from the root."""
         node = 0
         for decision in path:
             node = self.branching_factor * node + decision
@@ -126,12 +126,12 @@ class CTGraph:
 
     @takes_numbers
     def leaf_of(self, goal: Iterable[int]) -> int:
-        """Return the number of the end state that d decisions lead to: its base-b digits are the decisions less 1."""
+        """Return the number of a goal's end state: its base-b digits are the decisions less 1."""
         return self.node_at(goal) - self.num_decision_states
 
     @property
     def exact_reward_prob_random(self) -> Fraction:
-        """P_R without rounding, for the float that ``wait_prob`` is; see `reward_prob_random`."""
+        """`reward_prob_random` without rounding, for the float ``wait_prob``."""
         b = self.branching_factor
         p = Fraction(self.wait_prob)
         return (b + 1) * ((1 - p) / ((b + 1) * (b + 1 - p))) ** (self.depth + 1)
@@ -140,8 +140,8 @@ class CTGraph:
     def reward_prob_random(self) -> float:
         """P_R: the probability that a uniformly random policy reaches one given end state.
 
-        (b + 1) * ((1 - p) / ((b + 1) (b + 1 - p)))^(d + 1), the paper's closed form, correctly rounded. Below the
-        smallest float it is 0.0: see `log_reward_prob_random`.
+        (b + 1) * ((1 - p) / ((b + 1) (b + 1 - p)))^(d + 1), the paper's closed form, correctly rounded. 0.0 below the
+        smallest float, where `log_reward_prob_random` serves.
         """
         return float(self.exact_reward_prob_random)
 
@@ -166,8 +166,7 @@ class CTGraph:
     def expected_episode_length(self) -> float:
         """E[rho]: mean steps to an end state, (d + 1) / (1 - p) + d + 1.
 
-        Of a policy that waits at every wait state. Episodes in which a policy that waits with probability a < 1
-        gets to an end state are shorter: they stay with probability a p instead of p.
+        Of a policy that always waits at wait states; one that waits with probability a stays with a p instead of p.
         """
         return (self.depth + 1) / (1 - self.wait_prob) + self.depth + 1
 
@@ -175,11 +174,11 @@ class CTGraph:
     def episode_length_prob(self, length: int) -> float:
         """P(rho = length): one step at home, d decisions, and d + 1 wait states left with probability 1 - p per step.
 
-        A negative binomial: C(w - 1, d) (1 - p)^(d+1) p^(w-d-1) for w = length - d - 1 steps in wait states. As
-        `expected_episode_length`, of a policy that waits at every wait state.
+        A negative binomial: C(w - 1, d) (1 - p)^(d+1) p^(w-d-1) for w = length - d - 1 steps in wait states, under the
+        policy of `expected_episode_length`.
 
         Args:
-            length: steps of an episode; 0.0 below the shortest episode, which has 2 (d + 1).
+            length: steps of an episode; below 2 (d + 1) the result is 0.0.
 
         Raises:
             ValueError: if ``length`` is not an integer.

@@ -1,8 +1,7 @@
-"""The C code of the package, `kernel.c`, as a library, and its functions that work on tensors.
+"""The C code of the package, `kernel.c`, as a library of functions on tensors.
 
-It is compiled once, by the machine's C compiler, into a folder of the user's; without a compiler all else works. The
-name of the file holds the SHA-256 of its content, and a library that does not agree with it is not loaded, but made
-again. The functions give the bits of the tensor code, so it does not matter which of the two has run.
+The C compiler builds it once, into a folder of the user's; without a compiler all else works. The file's name holds the
+SHA-256 of its content; a library that differs is built again. The bits are those of the tensor code.
 """
 
 from __future__ import annotations
@@ -31,18 +30,18 @@ ROWS_A_THREAD = 2048
 
 
 def num_threads(num_rows: int, most: int) -> int:
-    """Return the number of threads to use for a number of rows, up to a maximum."""
+    """Return the threads to use for a number of rows."""
     return max(1, min(torch.get_num_threads(), most, num_rows // ROWS_A_THREAD))
 
 
 def takes(*tensors: Tensor) -> bool:
-    """Return whether the functions below can have these tensors: plain int64 or uint8 ones on the CPU, untraced."""
+    """Return whether the functions take these tensors: plain int64 or uint8 ones on the CPU, untraced."""
     fits = all(type(each) is Tensor and each.is_cpu and each.dtype in _DTYPES for each in tensors)
     return fits and not is_traced() and is_available()
 
 
 def is_traced() -> bool:
-    """Return whether ``torch.compile``, ``torch.vmap`` or another transform looks on: it must see tensor code."""
+    """Return whether ``torch.compile``, ``torch.vmap`` or another transform must see tensor code."""
     return (
         torch.compiler.is_compiling()
         or torch.jit.is_tracing()  # type: ignore[attr-defined]  # which its module's __all__ lacks
@@ -55,7 +54,7 @@ _DTYPES = (torch.int64, torch.uint8)
 
 
 def philox(words: Sequence[Tensor]) -> tuple[Tensor, ...]:
-    """`philox.philox` of the four words of the counter and the two of the key, int64 that broadcast."""
+    """`philox.philox` of the counter's four words and the key's two, int64 that broadcast."""
     shape = torch.broadcast_shapes(*(word.shape for word in words))
     given = [word.long() if word.numel() == 1 else word.long().expand(shape).contiguous() for word in words]
     made = torch.empty(4, *shape, dtype=torch.int64, device="cpu")
@@ -88,7 +87,7 @@ def add_noise(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
 
 @cache
 def is_available() -> bool:
-    """Return whether the library exists or can be built; a failed build is tried once in a process."""
+    """Return whether the library exists or can be built; a build fails once in a process."""
     try:
         library()
     except ValueError:
@@ -102,10 +101,10 @@ _FLAGS = ("-O3", "-march=native", "-std=gnu11", "-ffp-contract=off", "-fwrapv", 
 
 @cache
 def library() -> ctypes.CDLL:
-    """The functions, compiled if they were not before.
+    """The functions, compiled if need be.
 
     Raises:
-        ValueError: where they cannot be, saying why.
+        ValueError: if compiling fails, with the reason.
     """
     try:
         return _made()
@@ -126,12 +125,12 @@ def _made() -> ctypes.CDLL:
 
 
 def _name(key: str, content: bytes) -> str:
-    """The file name of a library, which says what decided its content and the content's SHA-256."""
+    """The library's file name, of what decides its content and the content's SHA-256."""
     return f"native-{key}-{hashlib.sha256(content).hexdigest()}.so"
 
 
 def _found(folder: Path, key: str) -> Path | None:
-    """Return the library of a key that was made before; remove one whose content has changed, as a crash leaves it."""
+    """Return the existing library of a key; remove one whose content a crash changed."""
     for path in folder.glob(f"native-{key}-*.so"):
         with suppress(FileNotFoundError):  # another process has removed it
             _require_own(path)
@@ -179,7 +178,7 @@ def _require_own(path: Path) -> None:
 
 
 def _compiled(source: Path, compiler: list[str], folder: Path, key: str) -> Path:
-    """Compile into its own file that then gets its name; processes that do so at once share nothing else."""
+    """Compile into a separate file that then gets its name, so that processes may do so at once."""
     with tempfile.TemporaryDirectory(dir=folder) as own:
         made = Path(own) / "native.so"
         _compile(source, compiler, made)

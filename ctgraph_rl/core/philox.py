@@ -1,9 +1,8 @@
 """Random numbers by counter, as pure tensor functions: Philox4x32-10 (Salmon et al. 2011).
 
 The 128-bit counter holds (ticks of the row, row, stream and block), the 64-bit key holds the seed. Different (seed,
-row, stream, tick) are different inputs of a bijection per key, so no two rows share a block by construction, and a
-row's draws depend on nothing but its seed, its number and how many observations it has had. Unsigned 32-bit words are
-held in int64.
+row, stream, tick) are different inputs of a bijection per key, so no two rows share a block, and a row's draws depend
+only on its seed, its number and its count of observations. Unsigned 32-bit words are held in int64.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from torch import Tensor
 from ctgraph_rl.core import kernel
 
 PhiloxWords = tuple[Tensor, ...]
-"""Words of 32 bits, each an int64 tensor with values in [0, 2**32)."""
+"""Words of 32 bits, int64 tensors in [0, 2**32)."""
 
 _WORD = 0xFFFFFFFF
 _MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)
@@ -22,27 +21,19 @@ _KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
 _ROUNDS = 10
 
 STREAM_STEP, STREAM_NOISE, STREAM_IMAGES, STREAM_REWARD, STREAM_GOAL, STREAM_TASK, STREAM_AGENT = range(7)
-"""What a draw is for: a step's small draws, pixel noise, image sets, the noise of rewards, changes of the goal, of
-the task, and what agents draw."""
+"""What a draw is for: a step's small draws, pixel noise, image sets, reward noise, changes of goal and of task, agents.
+"""
 _STREAM_SHIFT = 28  # 16 streams of 2**28 blocks each
 
 
 def philox(counter: PhiloxWords, key: PhiloxWords) -> PhiloxWords:
-    """Philox4x32-10: four random words for a counter of four words and a key of two.
-
-    Args:
-        counter: four words of broadcastable shapes.
-        key: two words, likewise.
-
-    Returns:
-        Four words.
-    """
+    """Philox4x32-10: four random words for a counter of four words and a key of two, of broadcastable shapes."""
     words = (*counter, *key)
     return kernel.philox(words) if kernel.takes(*words) else by_tensors(counter, key)
 
 
 def by_tensors(counter: PhiloxWords, key: PhiloxWords) -> PhiloxWords:
-    """`philox` where there is no C code."""
+    """`philox` without C code."""
     c0, c1, c2, c3 = counter
     k0, k1 = key
     for _ in range(_ROUNDS):
@@ -58,9 +49,9 @@ def by_tensors(counter: PhiloxWords, key: PhiloxWords) -> PhiloxWords:
 
 
 def _product(a: Tensor, b: Tensor | int) -> tuple[Tensor, Tensor]:
-    """The words of a 64-bit product of two words: the upper one in the low 32 bits of a number, and the lower one.
+    """The upper and the lower word of a 64-bit product of two words; the upper in the low 32 bits.
 
-    Compiled, no number may leave the range of int64: that is undefined in C++, where compilers make use of it.
+    No number may leave int64: overflow is undefined in compiled C++.
     """
     if not torch.compiler.is_compiling():
         product = a * b  # the low 64 bits are exact
@@ -78,7 +69,7 @@ def draw(seed: Tensor, row: Tensor, tick: Tensor, stream: int, block: Tensor | i
         row: int64 in [0, 2**32).
         tick: int64 >= 0.
         stream: one of the ``STREAM_*`` constants.
-        block: number of the block in [0, 2**28), for uses that need more than four words.
+        block: in [0, 2**28), for more than four words.
     """
     last = block + (stream << _STREAM_SHIFT)
     if not isinstance(last, Tensor):  # `torch.full` writes on the device, where `torch.as_tensor` copies from the CPU
@@ -93,7 +84,7 @@ _MIX = (-0x40A7B892E31B1A47, -0x6B2FB644ECCEEE15)
 
 
 def splitmix64(start: Tensor, count: int) -> Tensor:
-    """The first numbers of SplitMix64 (Steele, Lea and Flood 2014) for each start: cheap, for much noise at once.
+    """SplitMix64 (Steele, Lea and Flood 2014): the first ``count`` numbers for each start; cheap noise.
 
     Args:
         start: int64 [...], the seed of each sequence.
@@ -106,7 +97,7 @@ def splitmix64(start: Tensor, count: int) -> Tensor:
 
 
 def splitmix64_at(start: Tensor, place: Tensor) -> Tensor:
-    """The number of `splitmix64` at a place in its sequence; int64 tensors of shapes that broadcast."""
+    """The number at a place in `splitmix64`; int64 tensors that broadcast."""
     z = start + _GOLDEN * (place + 1)
     z.bitwise_xor_((z >> 30).bitwise_and_(0x3FFFFFFFF)).mul_(_MIX[0])
     z.bitwise_xor_((z >> 27).bitwise_and_(0x1FFFFFFFFF)).mul_(_MIX[1])
@@ -114,12 +105,12 @@ def splitmix64_at(start: Tensor, place: Tensor) -> Tensor:
 
 
 def randint(word: Tensor, high: Tensor | int) -> Tensor:
-    """A word as an integer in [0, high); each value's probability is off by less than 2**-32."""
+    """A word as an integer in [0, high); probabilities are off by less than 2**-32."""
     return (word * high) >> 32
 
 
 def randint_wide(words: tuple[Tensor, Tensor], high: Tensor) -> Tensor:
-    """Two words as an integer in [0, high) for any high up to 2**62; off by less than 2**-64 per value."""
+    """Two words as an integer in [0, high), high <= 2**62; probabilities are off by less than 2**-64."""
     upper, lower = words
     high_upper = high >> 32
     high_lower = high & _WORD
@@ -134,7 +125,7 @@ _NORMAL_UNIT = 2.0**-20
 
 
 def normal_table() -> Tensor:
-    """Upper-tail quantiles of the normal distribution at (1 + i / 256) 2**e, e = -1..30, for `normal`; float64."""
+    """Upper-tail quantiles of the normal distribution at (1 + i / 256) 2**e, e = -1..30; float64."""
     cell = torch.arange(32 * _NORMAL_CELLS + 1, dtype=torch.float64, device="cpu")
     octave = (cell / _NORMAL_CELLS).floor()
     tail = (1 + cell / _NORMAL_CELLS - octave) * 2 ** (octave - 1 - 32)
@@ -144,8 +135,8 @@ def normal_table() -> Tensor:
 def normal(word: Tensor, table: Tensor) -> Tensor:
     """A word as a standard normal number, a multiple of 2**-20 up to 6.3 in size; float64.
 
-    The inverse distribution function by linear interpolation in 256 cells per octave of the tail probability. Every
-    operation is exact in float64, so devices and compiled code agree bit by bit.
+    The inverse distribution function by linear interpolation in 256 cells per octave of the tail. Every operation is
+    exact in float64, so devices and compiled code agree bit by bit.
     """
     tail = (word >> 1).to(torch.float64) + 0.5
     bits = tail.view(torch.int64)  # of a double: octave, cell, place in it

@@ -1,4 +1,4 @@
-"""What changes an image when it is read: noise, late rotation and the reward cue, as pure tensor functions.
+"""Noise, late rotation and the reward cue on read, as pure tensor functions.
 
 Shapes: N rows; every tensor is [N] unless said otherwise.
 """
@@ -15,12 +15,11 @@ from ctgraph_rl.core.philox import STREAM_NOISE, draw, splitmix64, splitmix64_at
 def add_noise(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
     """Add to each pixel an independent integer drawn from 0..read_noise, saturating at 255.
 
-    A pixel has 16 bits of the SplitMix64 sequence of its observation, so each value's probability is off by less than
-    2**-16.
+    A pixel has 16 bits of its observation's SplitMix64 sequence: probabilities are off by less than 2**-16.
 
     Args:
         images: uint8 [N, 1, r, r].
-        start: int64, a random start of the sequence for each observation.
+        start: int64, random, per observation.
         read_noise: largest addition per row, 0..255.
 
     Returns:
@@ -65,7 +64,7 @@ def noisy(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
 
 
 def by_pixel(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
-    """`add_noise` where each pixel draws its number by itself: more arithmetic, and one kernel where it is compiled."""
+    """`add_noise` where each pixel draws separately: more arithmetic, one kernel if compiled."""
     start = start.unsqueeze(-1)
     high = (read_noise + 1).long().unsqueeze(-1)
     pixel = torch.arange(images[0].numel(), device=images.device) + (start & 0)  # [N, pixels]: a faster kernel
@@ -82,7 +81,7 @@ _opaque.register_fake(lambda images, start, read_noise: torch.empty_like(images)
 
 
 def noise_bank(levels: tuple[int, ...], size: int, shape: tuple[int, ...]) -> Tensor:
-    """Noise drawn in advance: for each largest addition so many noises, uint8 [levels * size, *shape]."""
+    """Noise drawn in advance, by largest addition: uint8 [levels * size, *shape]."""
     numbers = torch.arange(len(levels) * size, device="cpu")
     zero = numbers.new_tensor(0)
     upper, lower, *_ = draw(zero, numbers, zero, STREAM_NOISE)
@@ -93,17 +92,17 @@ def noise_bank(levels: tuple[int, ...], size: int, shape: tuple[int, ...]) -> Te
 
 
 def add_saturating(images: Tensor, noise: Tensor) -> Tensor:
-    """The sum of two uint8 tensors of the same shape, at most 255."""
+    """The sum of two uint8 tensors, at most 255."""
     return images + torch.minimum(noise, 255 - images)
 
 
 def cue_level(share: Tensor, white: Tensor, wraps: Tensor) -> Tensor:
-    """The brightness of a reward: white for the goal's, 0 for none, in between cut off; uint8.
+    """The brightness of a reward: white for the goal's, 0 for none, truncated; uint8.
 
     Args:
         share: float64, the reward as a share of the goal's.
         white: float64.
-        wraps: bool, the rows where a level out of range is taken modulo 256; in the others it saturates.
+        wraps: bool, rows where levels are taken modulo 256 instead of saturating.
     """
     level = (share * white).trunc()
     saturated = torch.minimum(level.clamp_min(0), white.trunc())
@@ -134,7 +133,7 @@ def add_cue(images: Tensor, level: Tensor, shows: Tensor, element: Tensor) -> Te
 
 
 def turn(images: Tensor, angle: Tensor, taps: tuple[Tensor, Tensor]) -> Tensor:
-    """Rotate each image by its own angle, as `rotation.rotate` does.
+    """Rotate each image by its angle, as `rotation.rotate`.
 
     Args:
         images: uint8 [N, 1, r, r].

@@ -1,6 +1,6 @@
-"""Regions: functions of tensors that GPUs replay as CUDA graphs, without Python and without a wait of the host.
+"""Regions: functions of tensors that GPUs replay as CUDA graphs, without Python and without waits of the host.
 
-Tensordict's `CudaGraphModule` waits for the device at every call, so it is not used.
+Tensordict's `CudaGraphModule` waits at every call.
 """
 
 from __future__ import annotations
@@ -15,27 +15,27 @@ Tensors = Mapping[Any, Tensor]
 """Tensors by key."""
 
 OwnTensors = dict[Any, Tensor]
-"""Tensors by key, in memory of a region."""
+"""Tensors by key, in a region's memory."""
 
 WARM_UP = 3
-"""Calls before a function is captured: libraries and kernels are loaded, and optimisers make their state."""
+"""Calls before capture, which load kernels and make optimisers' state."""
 
 
 def captures(device: torch.device | None) -> bool:
-    """Return whether regions on a device are captured: those on GPUs."""
+    """Return whether regions on a device are captured: on GPUs."""
     return device is not None and device.type == "cuda"
 
 
 class Region:
     """A function of tensors with separate memory for its arguments and its results.
 
-    On a GPU the first `WARM_UP` calls run the function; then it is captured as a CUDA graph, and each further call
-    copies the arguments and launches the graph. Elsewhere every call runs the function, on copies of the arguments and
-    with copies of the results, so that a caller that keeps a result too long fails on a CPU as well.
+    On a GPU the first `WARM_UP` calls run the function; then it is captured as a CUDA graph, and each call copies the
+    arguments and launches the graph. Elsewhere every call runs the function on copies, and returns copies, so that
+    keeping a result too long fails on a CPU as well.
 
     Args:
-        function: takes and returns tensors by key. It must not branch on data, make the host wait, or change the shapes
-            of its results. Tensors of others that it writes to, such as weights, must stay in place.
+        function: must not branch on data, make the host wait, or change its results' shapes. Other tensors that it
+            writes to, such as weights, must stay in place.
     """
 
     def __init__(self, function: Callable[[OwnTensors], Tensors]) -> None:
@@ -46,11 +46,7 @@ class Region:
         self._results: OwnTensors = {}
 
     def __call__(self, arguments: Tensors) -> OwnTensors:
-        """Return the function's results, which the next call overwrites.
-
-        Args:
-            arguments: tensors of the keys, shapes and dtypes of the first call.
-        """
+        """Return the results, which the next call overwrites. Keys, shapes and dtypes stay as in the first call."""
         self._write(self._arguments, arguments)
         self._calls += 1
         if not captures(next(iter(self._arguments.values())).device):
@@ -72,12 +68,12 @@ class Region:
         return dict(self._results)
 
     def copies(self, arguments: Tensors) -> OwnTensors:
-        """Return the function's results, all of one shape, as copies."""
+        """Return the results, all of one shape, as copies."""
         found = self(arguments)
         return dict(zip(found, torch.stack(list(found.values())).unbind(), strict=True))
 
     def takes(self, arguments: Tensors) -> bool:
-        """Return whether arguments have the shapes of the first call's; any, before the first call."""
+        """Return whether arguments have the first call's shapes."""
         shapes = {key: value.shape for key, value in self._arguments.items()}
         return not shapes or shapes == {key: value.shape for key, value in arguments.items()}
 
@@ -86,7 +82,6 @@ class Region:
 
     @staticmethod
     def _write(buffers: OwnTensors, values: Tensors) -> None:
-        """Write values into buffers, which the first call makes."""
         if not buffers:
             buffers.update({key: value.detach().clone() for key, value in values.items()})
             return

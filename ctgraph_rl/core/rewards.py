@@ -1,8 +1,7 @@
-"""g: what an end state pays. One small frozen dataclass per reward, called with tensors.
+"""g: what an end state pays, a frozen dataclass per reward, called with tensors.
 
-A reward returns a share of ``Task.goal_reward``: 1 at the goal. Everything it needs is in its argument, so a user's own
-reward is a frozen dataclass (equal and hashable by value) with the same ``__call__``, named by ``_target_`` in yaml. It
-may have ``bounds``, as the rewards here; without it, intervals of returns are those of numbers without bounds.
+A reward returns a share of ``Task.goal_reward``: 1 at the goal. A user's own is a frozen dataclass with the same
+``__call__``, named by ``_target_`` in yaml. It may have ``bounds``, as here; without it returns are unbounded.
 """
 
 from __future__ import annotations
@@ -15,10 +14,7 @@ from torch import Tensor
 
 
 class Arrival(NamedTuple):
-    """The end states that the rows arrived at; int64 [N].
-
-    Rows that have not arrived have values without meaning, and what is computed for them is ignored.
-    """
+    """The end states that rows arrived at; int64 [N], without meaning in other rows."""
 
     leaf: Tensor  # in [0, b**d); its base-b digits are the decisions taken, the first one leading
     goal_leaf: Tensor
@@ -27,7 +23,7 @@ class Arrival(NamedTuple):
     max_depth: int  # the largest depth of the batch
 
     def differences(self) -> Tensor:
-        """|decision taken - decision of the goal|, last decision first, 0 beyond a row's depth: [N, max_depth]."""
+        """|decision taken - goal's decision|, last first, 0 beyond a row's depth: [N, max_depth]."""
         place = torch.arange(self.max_depth, device=self.leaf.device)
         base = self.branching_factor.unsqueeze(-1)
         valid = place < self.depth.unsqueeze(-1)
@@ -40,33 +36,33 @@ class RewardFn(Protocol):
     """A reward over end states."""
 
     def __call__(self, arrival: Arrival) -> Tensor:
-        """The share of ``goal_reward`` that each row's end state pays, float32 [N]."""
+        """The share of ``goal_reward`` that each end state pays, float32 [N]."""
         ...
 
 
 @dataclass(frozen=True)
 class Needle:
-    """1 at the goal and 0 at every other end state: the needle in a haystack of the paper, section 2.5."""
+    """1 at the goal and 0 at every other end state (section 2.5 of the paper)."""
 
     def __call__(self, arrival: Arrival) -> Tensor:
-        """Return 1 at the goal, else 0."""
+        """Shares, float32 [N]."""
         return (arrival.leaf == arrival.goal_leaf).to(torch.float32)
 
     def bounds(self, branching_factor: int) -> tuple[float, float]:
-        """Return the lowest and the highest share."""
+        """Lowest and highest share."""
         return 0.0, 1.0
 
 
 @dataclass(frozen=True)
 class Gradient:
-    """Reward that shrinks with the weighted distance between the decisions taken and the goal's, in [0, 1].
+    """Reward in [0, 1] that shrinks with the weighted distance of the decisions from the goal's.
 
     1 - sum_k b^(d-k) |D_k - G_k| / (b^d - 1), k = 1..d: an early wrong decision costs more than a late one. The
     paper's reward gradient (section 2.5) with its weights corrected to b^(d-1)..b^0.
     """
 
     def __call__(self, arrival: Arrival) -> Tensor:
-        """Return 1 less the weighted distance."""
+        """Shares, float32 [N]."""
         b = arrival.branching_factor
         depth = arrival.depth
         place = torch.arange(arrival.max_depth, device=b.device)
@@ -75,7 +71,7 @@ class Gradient:
         return (1 - lost.double() / (b**depth - 1).double()).float()
 
     def bounds(self, branching_factor: int) -> tuple[float, float]:
-        """Return the lowest and the highest share."""
+        """Lowest and highest share."""
         return 0.0, 1.0
 
 
@@ -87,19 +83,19 @@ class ReferenceLinear:
     """
 
     def __call__(self, arrival: Arrival) -> Tensor:
-        """Return 1 less the weighted distance, in shares of the largest for b=2."""
+        """Shares, float32 [N]."""
         place = torch.arange(1, arrival.max_depth + 1, device=arrival.leaf.device)
         depth = arrival.depth
         lost = (place * arrival.differences()).sum(-1)  # the last decision weighs 1, the first one d
         return (1 - lost.double() / (depth * (depth + 1) / 2)).float()
 
     def bounds(self, branching_factor: int) -> tuple[float, float]:
-        """Return the lowest and the highest share; the lowest is that of decisions as far from the goal's as can be."""
+        """Lowest and highest share; the lowest is at the farthest decisions."""
         return 2.0 - branching_factor, 1.0
 
 
 KERNEL_REWARDS = (Needle, Gradient, ReferenceLinear)
-"""The rewards that ``kernel.c`` computes, in its order; any other one, a user's own too, needs the tensor engine."""
+"""Rewards that ``kernel.c`` computes, in its order; others need the tensor engine."""
 
 REWARD_FNS: dict[str, type] = {"needle": Needle, "gradient": Gradient, "reference_linear": ReferenceLinear}
-"""Every reward of this package by the name that settings have; JSON names them by their classes."""
+"""Every reward of this package by its name in settings."""

@@ -19,7 +19,7 @@ def rotate(images: Tensor, degrees: int) -> Tensor:
         degrees: whole degrees.
 
     Returns:
-        uint8 [n, r, r], rounded to the nearest level. Integer arithmetic with 16-bit weights: equal on every machine.
+        uint8 [n, r, r], rounded; weights have 16 bits.
     """
     if degrees % 360 == 0:
         return images
@@ -32,7 +32,7 @@ def rotate(images: Tensor, degrees: int) -> Tensor:
 
 @lru_cache(maxsize=512)
 def compute_taps(size: int, degrees: int) -> tuple[Tensor, Tensor]:
-    """For each pixel the four source pixels and their weights * 2**16; both int64 [r * r, 4]."""
+    """Each pixel's four source pixels and their weights * 2**16; int64 [r * r, 4] each."""
     angle = math.radians(degrees)
     centre = (size - 1) / 2
     grid = torch.arange(size, dtype=torch.float64, device="cpu") - centre

@@ -1,4 +1,4 @@
-"""What the dynamics need to know of each row's task, as tensors that stay the same between two changes of tasks.
+"""What the dynamics need of each row's task, as tensors that stay between changes of tasks.
 
 Shapes: N rows; every tensor is [N] unless said otherwise.
 """
@@ -14,7 +14,7 @@ from ctgraph_rl.core.tree import TreeParams
 
 
 class LegacyIndex(NamedTuple):
-    """The numbers that `Observations.legacy_index` gives the states of each row's task; int64."""
+    """Each row's numbers of `Observations.legacy_index`; int64."""
 
     level_first: Tensor  # [N, D + 1]: first node of a level, in rows of less depth 2**63 - 1 beyond it
     level_shift: Tensor  # [N, D + 1]: what is added to a node of the level
@@ -22,11 +22,11 @@ class LegacyIndex(NamedTuple):
 
 
 class ObservationParams(NamedTuple):
-    """What the observation process X and the reading of images need to know of each row's task; int64 if not said.
+    """What X and reading need of each row's task; int64 if not said.
 
-    An image is a row of the bank: the first view of the state's kind, plus the node's where ids are unique, plus a draw
-    of an id, plus a draw of a view, which is one of the id's instances in one of its rotations. Tables [U * 5] have an
-    entry for each of U different tasks and each state type.
+    A bank's row is the first view of the state's kind, plus the node's where ids are unique, plus a draw of an id, plus
+    a draw of a view: an instance in one of its rotations. Tables [U * 5] have an entry per different task and state
+    type.
     """
 
     first_kind: Tensor | None  # where the row's task begins in the tables; None for U = 1
@@ -47,7 +47,7 @@ class ObservationParams(NamedTuple):
 
 
 class RewardParams(NamedTuple):
-    """What rewards and goals need to know of each row's task."""
+    """What rewards and goals need of each row's task."""
 
     depth: Tensor  # int64
     num_leaves: Tensor  # int64
@@ -63,7 +63,7 @@ class RewardParams(NamedTuple):
 
 
 class RowParams(NamedTuple):
-    """Everything that stays the same between two changes of tasks."""
+    """All that stays between changes of tasks."""
 
     seed: Tensor  # int64 [1], or [N] for rows with their own seeds
     row: Tensor  # numbers of the rows
@@ -76,7 +76,7 @@ class RowParams(NamedTuple):
 
 
 class Uses(NamedTuple):
-    """What the rows of a batch have use for, as plain Python values; the rest is not computed."""
+    """What a batch's rows use; the rest is not computed."""
 
     waits: bool = True  # p > 0
     unique_ids: bool = True
@@ -95,5 +95,5 @@ class Uses(NamedTuple):
 
     @property
     def draws(self) -> bool:
-        """Return whether a tick needs random words."""
+        """Whether a tick needs random words."""
         return self.waits or self.drawn_ids or self.views

@@ -1,9 +1,8 @@
-"""The tree's own dynamics, section 2 of the paper: which state an action leads to.
+"""The tree's dynamics, section 2 of the paper: which state an action leads to.
 
 A state is two integers per row, ``state_type`` and ``node``: the heap index of the position in the tree (the root is 0,
-branch a of node n is b * n + a). A wait state carries the node that it leads to.
-
-Shapes: N rows; every tensor is [N] unless said otherwise.
+branch a of node n is b * n + a). A wait state carries the node that it leads to. Every tensor is [N], for N rows,
+unless said otherwise.
 """
 
 from __future__ import annotations
@@ -36,14 +35,14 @@ class HasState(Protocol):
 
 
 class State(NamedTuple):
-    """The position of each row in its tree."""
+    """Each row's position in its tree."""
 
     state_type: Tensor  # uint8
     node: Tensor  # int64
 
 
 class Swap(NamedTuple):
-    """Two decisions of one decision state of each row's tree that lead to each other's branch; int64."""
+    """Two decisions of one decision state per row that lead to each other's branch; int64."""
 
     node: Tensor  # the decision state; -1 for none
     first: Tensor  # a decision
@@ -51,7 +50,7 @@ class Swap(NamedTuple):
 
 
 class TreeParams(NamedTuple):
-    """What the transition needs to know of each row's task; int64 if not said. `tree_params` makes it."""
+    """What the transition needs of each row's task, by `tree_params`; int64 if not said."""
 
     branching_factor: Tensor
     first_leaf: Tensor  # heap index of the first end state, the number of decision states
@@ -72,7 +71,7 @@ def tree_params(
     extra_end_step: Tensor | None = None,
     swap: Swap | None = None,
 ) -> TreeParams:
-    """The parameters of trees, with tables of the moves of each different one."""
+    """Return trees' parameters, with a table of moves for each different one."""
     extra = torch.zeros_like(branching_factor) if extra_end_step is None else extra_end_step.long()
     different, which = torch.unique(2 * branching_factor.clamp_max(MAX_TABLED + 1) + extra, return_inverse=True)
     largest = int(branching_factor.max())
@@ -98,7 +97,7 @@ def tree_params(
 
 
 def _moves(branching_factor: int, extra_end_step: bool, last_action: int) -> list[list[list[list[int]]]]:
-    """Return where an action leads, section 2 of the paper: [stays, before an end state, state type, action]."""
+    """Return where actions lead: [stays, before an end state, state type, action]."""
 
     def next_kind(stays: bool, before_end: bool, kind: int, action: int) -> int:
         waits = action == WAIT_ACTION
@@ -123,17 +122,16 @@ def _moves(branching_factor: int, extra_end_step: bool, last_action: int) -> lis
 
 
 def transition(state: State, action: Tensor, stays: Tensor | None, tree: TreeParams) -> State:
-    """One step of the tree: tables say which kind of state follows, arithmetic says which node.
+    """One step of the tree, by tables for the kind of state and arithmetic for the node.
 
     Args:
-        state: current state; an end or fail state is absorbing.
-        action: int64, 0 waits and 1..b decides; any other fails as a wrong action does.
+        state: end and fail states are absorbing.
+        action: int64, 0 waits and 1..b decides; any other fails.
         stays: bool, the row's draw with probability p; None if no row ever stays.
-        tree: the rows' trees.
 
     Returns:
-        The next state. ``node`` of a fail state is where it failed. An episode with an extra end step is over in a home
-        state whose node is an end state's.
+        The next state. A fail state's ``node`` is where it failed. With an extra end step an episode ends in a home
+        state with an end state's node.
     """
     kind, node = state
     block = len(StateType) * tree.width
@@ -153,7 +151,7 @@ def transition(state: State, action: Tensor, stays: Tensor | None, tree: TreePar
 
 
 def branch_of(node: Tensor, decision: Tensor, swap: Swap | None) -> Tensor:
-    """Return the branch, in 1..b, that a decision leads to; as well the decision that leads to a branch."""
+    """Return the branch, in 1..b, of a decision, or the decision of a branch."""
     if swap is None:
         return decision
     swapped = (node == swap.node) & ((decision == swap.first) | (decision == swap.second))
@@ -165,7 +163,7 @@ def _look_up(table: Tensor, index: Tensor) -> Tensor:
 
 
 def is_done(state: HasState, tree: TreeParams) -> Tensor:
-    """bool: the episode is over, so the row needs a reset."""
+    """bool: the row needs a reset."""
     done = state.state_type >= _END
     if tree.extra_end_step is None:
         return done
@@ -174,5 +172,5 @@ def is_done(state: HasState, tree: TreeParams) -> Tensor:
 
 
 def stays(words: tuple[Tensor, ...], tree: TreeParams) -> Tensor:
-    """The wait draw: True with probability p, exact to 2**-63. Uses words 0 and 1."""
+    """The wait draw, words 0 and 1: True with probability p, exact to 2**-63."""
     return ((words[0] << 31) | (words[1] >> 1)) < tree.stay_below

@@ -1,5 +1,4 @@
-"""Measurements: the log of a run, its tables, its metrics and what is recorded about where they come from.
+"""Measurements: a run's log, tables, metrics and provenance.
 
-It imports `ctgraph_rl.tasks` and `ctgraph_rl.metrics`; the loop in `ctgraph_rl.learn` writes logs, and runs and
-reports read them.
+The loop in `ctgraph_rl.learn` writes logs; runs and reports read them.
 """

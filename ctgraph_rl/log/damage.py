@@ -1,6 +1,6 @@
 """Finds the files of a finished run that are not as they were written.
 
-Runs of earlier versions have no `ctgraph_rl.log.sums.SUMS`: of theirs it is checked that the files can be read.
+Runs of earlier versions have no `ctgraph_rl.log.sums.SUMS`; their files must only be readable.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MOST_BYTES_OF_A_FILE = 2**33
 
 
 def damaged(run_dir: Path) -> list[str]:
-    """Return the files of a run that says that it is complete which are not as they were written; reads all of them."""
+    """Return the files of a complete run that are not as they were written; reads all of them."""
     if not (run_dir / SUMS).exists():
         return [name for name, check in _CHECKS.items() if not _is_readable(run_dir / name, check)]
     sums = stored_sums(run_dir)
@@ -36,7 +36,7 @@ def _is_same(path: Path, stored: ReadOnlyValues) -> bool:
 
 
 def _is_log(path: Path) -> bool:
-    """Return whether it is the log of a run, to its end."""
+    """Return whether a file is a run's whole log."""
     log = RunLog.read(path)
     return bool(log.of_kind("run")) and not log.torn_lines
 
@@ -56,7 +56,7 @@ _CHECKS: dict[str, Callable[[Path], bool]] = {
 
 
 def _is_readable(path: Path, check: Callable[[Path], bool]) -> bool:
-    """Return whether a file passes a check; all but the log may be missing, as only our runs write them."""
+    """Return whether a file passes a check; all but the log may be missing."""
     try:
         return path.is_file() and check(path) if path.exists() or path.name == LOG else True
     except (OSError, ValueError, RecursionError):
@@ -64,10 +64,10 @@ def _is_readable(path: Path, check: Callable[[Path], bool]) -> bool:
 
 
 def metrics_of(content: bytes) -> NamedValues:
-    """Return what `metrics_text` has written, as plain values by name.
+    """Return the content of `metrics_text` as plain values by name.
 
     Raises:
-        ValueError: for what are no metrics.
+        ValueError: for anything else.
     """
     found = json_value(content)
     ours = isinstance(found, dict) and bool(found) and all(map(_is_metric, found.values()))
@@ -76,7 +76,7 @@ def metrics_of(content: bytes) -> NamedValues:
 
 
 def _is_metric(metric: Any) -> bool:
-    """Return whether it has the fields that tables show of a metric."""
+    """Return whether it has the fields of a metric that tables show."""
     if not (isinstance(metric, dict) and {"value", "definition", "undefined"} <= metric.keys()):
         return False
     number = metric["value"] is None or is_real(metric["value"], -LARGEST, LARGEST)

@@ -1,8 +1,8 @@
-"""Names, labels, sources, settings and reasons as text, whatever they hold: one function for each kind of output.
+"""Names, labels, sources, settings and reasons as text for each kind of output, whatever they hold.
 
-They may come from other people. `terminal_text` also serves HTML, where the template escapes what it gives, and JSON,
-whose own quoting is enough. Characters that cannot be printed, such as escape sequences, marks of writing direction and
-halves of surrogate pairs, are shown as in Python, ``\\x1b``.
+They may come from other people. `terminal_text` also serves HTML, whose template escapes it, and JSON. Characters that
+cannot be printed, such as escape sequences, marks of writing direction and halves of surrogate pairs, are shown as in
+Python, ``\x1b``.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r", "'")
-"""Beginnings of a CSV cell that programs for tables may take for a formula, and the mark itself."""
+"""Beginnings of a CSV cell that programs may take for a formula, and the mark."""
 
 MARK = "'"
-"""Stands before a text of a CSV file that begins with one of `FORMULA`; a reader takes one off."""
+"""Stands before a CSV text that begins with one of `FORMULA`; readers take one off."""
 
 _INACTIVE = re.compile(r"-?[\d,]+(\.\d+)?( \[-?[\d.]+, -?[\d.]+\])?( n = [\d/]+)?")
 _MARKDOWN = re.compile(
@@ -40,12 +40,12 @@ _LATEX = str.maketrans(
 
 
 def terminal_text(text: object) -> str:
-    """Return one line without a character that a terminal obeys."""
+    """Return one line without characters that a terminal obeys."""
     return _printable(" ".join(str(text).split()))
 
 
 def terminal_lines(text: object) -> str:
-    """Return lines without a character that a terminal obeys."""
+    """Return lines without characters that a terminal obeys."""
     return "\n".join(map(_printable, str(text).split("\n")))
 
 
@@ -54,14 +54,14 @@ def _printable(text: str) -> str:
 
 
 def listed(values: Iterable[object], most: int = 3) -> str:
-    """Return the first of some values as text, and how many more there are."""
+    """Return the first of some values as text, and the number of others."""
     texts = list(map(str, values))
     more = f" and {len(texts) - most} more" if len(texts) > most else ""
     return ", ".join(texts[:most]) + more
 
 
 def markdown_text(text: object) -> str:
-    """Return one line that Markdown shows unchanged: no link, no image, no HTML, no formula and no end of a cell."""
+    """Return one line that Markdown shows unchanged: no link, image, HTML, formula or end of a cell."""
     line = terminal_text(text)
     if _INACTIVE.fullmatch(line):
         return line
@@ -70,33 +70,28 @@ def markdown_text(text: object) -> str:
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Iterable[str]]) -> str:
-    """Return a table in Markdown, of cells that are Markdown."""
+    """Return a table of Markdown cells."""
     lines = [f"| {' | '.join(row)} |" for row in (head, *rows)]
     return "\n".join([lines[0], f"|{'---|' * len(head)}", *lines[1:]])
 
 
 def latex_text(text: object) -> str:
-    """Return one line that LaTeX shows unchanged, after the end of a table's row too."""
+    """Return one line that LaTeX shows unchanged, also after a table's row."""
     return terminal_text(text).translate(_LATEX)
 
 
 def figure_text(text: object) -> str:
-    """Return one line that matplotlib shows unchanged, without formulas."""
+    """Return one line that matplotlib shows unchanged."""
     return terminal_text(text).replace("$", r"\$")
 
 
 def csv_text(rows: Iterable[Iterable[Any]], end: str = "\n") -> str:
-    """Return rows as CSV; a text that begins with one of `FORMULA` has `MARK` before it.
-
-    Args:
-        rows: cells; None is an empty one.
-        end: of a line.
-    """
+    """Return rows as CSV, with `MARK` before texts that begin with one of `FORMULA`; None is an empty cell."""
     return end.join([*map(_line, rows), ""])
 
 
 def _line(row: Iterable[Any]) -> str:
-    """A line without its end; cells with an end of a line of any kind are quoted."""
+    """A line without its end; cells with any end of line are quoted."""
     file = io.StringIO(newline="")
     csv.writer(file, lineterminator="\r\n").writerow(map(_cell, row))
     return file.getvalue().removesuffix("\r\n")
@@ -107,5 +102,5 @@ def _cell(value: Any) -> Any:
 
 
 def utf8_text(text: object) -> object:
-    """Return a text that UTF-8 can hold, with halves of surrogate pairs as in Python; any other value unchanged."""
+    """Return a text that UTF-8 can hold, with halves of surrogate pairs as in Python; other values unchanged."""
     return text.encode("utf-8", "backslashreplace").decode() if isinstance(text, str) else text

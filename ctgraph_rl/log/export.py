@@ -1,7 +1,7 @@
 """A run in another program's format.
 
-l2metrics reads log format 1.1 of l2logger. A training interval, and an evaluation of a task, is one experience with its
-mean return as reward. Time stamps count experiences, so that equal runs give equal files.
+l2metrics reads log format 1.1 of l2logger. A training interval, or an evaluation of a task, is one experience with its
+mean return as reward. Time stamps count experiences, so equal runs give equal files.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ def write_l2logger(regimes: Sequence[Regime], folder: Path | str) -> None:
     """Write regimes as a log of l2logger 1.1.
 
     Args:
-        regimes: a run, such as of `RunLog.regimes`, or an expert's, which trains one task.
-        folder: is made; l2metrics calls the run by its name.
+        regimes: a run's, such as of `RunLog.regimes`, or an expert's.
+        folder: new or empty; its name is the run's in l2metrics.
 
     Raises:
         ValueError: if the folder holds something.
@@ -73,7 +73,7 @@ def write_l2logger(regimes: Sequence[Regime], folder: Path | str) -> None:
 def numbered(regimes: Sequence[Regime]) -> Iterator[tuple[int, Regime]]:
     """Regimes with block numbers from 0: a block per training, and one for the evaluations of different tasks after it.
 
-    l2metrics would take two evaluations of a task in one block for one.
+    Of two evaluations of a task in one block l2metrics would make one.
     """
     block = -1
     evaluated: set[str] | None = None
@@ -87,7 +87,7 @@ def numbered(regimes: Sequence[Regime]) -> Iterator[tuple[int, Regime]]:
 
 
 def task_names(regimes: Sequence[Regime]) -> dict[str, str]:
-    """Names of the form that l2logger asks for, in lower case: ``ctgraph_1goal11`` for the first task, ``goal1.1``."""
+    """Names as l2logger wants them: ``ctgraph_1goal11`` for the first task, ``goal1.1``."""
     tasks = dict.fromkeys(regime.task for regime in regimes)
     return {task: f"ctgraph_{i}{re.sub('[^0-9a-z]', '', task.lower())}" for i, task in enumerate(tasks, 1)}
 

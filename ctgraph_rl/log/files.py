@@ -15,39 +15,39 @@ from weakref import WeakSet
 from ctgraph_rl.disk import open_own, read_regular
 
 LOG, AGENT, METRICS, CURRICULUM = "run.jsonl", "agent.pt", "metrics.json", "curriculum.json"
-"""Files of a run's directory; `METRICS` is there when the run is complete."""
+"""Files of a run; `METRICS` is there when it is complete."""
 
 FAILURE = "failed.txt"
-"""Says why a run ended by an error."""
+"""Why a run ended by an error."""
 
 MOST_BYTES_OF_METRICS, MOST_BYTES_OF_A_REASON = 2**24, 2**16
-"""Largest `METRICS`, and largest `FAILURE` and `LOCK`, that are read."""
+"""Largest `METRICS`, and `FAILURE` or `LOCK`, that are read."""
 
 CHECKPOINTS = "checkpoints"
-"""The folder with the checkpoints of an unfinished run."""
+"""The folder of an unfinished run's checkpoints."""
 
 LOCK = ".lock"
-"""The file in a directory that names the process that has locked it."""
+"""Names the process that has locked a directory."""
 
 WITH_LOCKS = (
     "keep runs on a file system with locks (flock): set hydra.run.dir, with -m hydra.sweep.dir, and experts_dir"
 )
 
 EX_TEMPFAIL = 75
-"""Exit code of a command whose directory another process writes: a queue that restarts failed commands tries again."""
+"""Exit code of a command whose directory another process writes, so that a queue tries again."""
 
 SECONDS_BETWEEN_ATTEMPTS = 0.5
-"""To get a lock that another writer has."""
+"""To get a lock."""
 
 BY_WAY_OF = b"\nby way of "
 """Stands in a lock file between who has the directory and the lock file that is locked for it."""
 
 ATTEMPTS_TO_READ = 10
-"""Who has a lock, within half a second."""
+"""To read who has a lock, within half a second."""
 
 
 def member_folder(folder: Path, number: int) -> Path:
-    """Return the run directory of a member of a collective, counted from 0, within the collective's."""
+    """Return the run directory of a collective's member, from 0."""
     return folder / f"member_{number:03d}"
 
 
@@ -58,7 +58,7 @@ def list_members(folder: Path) -> list[Path]:
 
 @contextmanager
 def locked(folder: Path, waiting: Callable[[], object] | None = None) -> Iterator[None]:
-    """Keep all other writers out of a directory; see `Locks.add`."""
+    """Keep other writers out of a directory, by `Locks.add`."""
     with closing(Locks()) as locks:
         locks.add(folder, waiting)
         yield
@@ -66,10 +66,10 @@ def locked(folder: Path, waiting: Callable[[], object] | None = None) -> Iterato
 
 @contextmanager
 def locked_new(folder: Path) -> Iterator[None]:
-    """Keep all other writers from making a folder, by a lock beside it, where the folder to come has a parent.
+    """Keep other writers from making a folder, by a lock beside it, if its parent exists.
 
     Raises:
-        BlockingIOError, OSError: see `Locks.add`.
+        BlockingIOError, OSError: as `Locks.add`.
     """
     with closing(Locks()) as locks:
         locks.add(folder, None, folder.parent / f".{folder.name}{LOCK}")
@@ -77,11 +77,11 @@ def locked_new(folder: Path) -> Iterator[None]:
 
 
 _held: WeakSet[BinaryIO] = WeakSet()
-"""The lock files of this process."""
+"""This process's lock files."""
 
 
 def _close_copies() -> None:
-    """Close the lock files that a forked process has of its parent, whose lock would last until both have ended."""
+    """Close a forked process's copies of its parent's lock files, which would outlast the parent."""
     for file in [*_held]:
         file.close()
 
@@ -91,9 +91,9 @@ if hasattr(os, "register_at_fork"):
 
 
 class Locks:
-    """Keeps all other writers out of directories, those of this process too; all locks end with the process at last.
+    """Keeps all other writers out of directories, also those of this process; locks end with the process at last.
 
-    The first lock file is open and locked. Those of more directories name it, so that one is open for any number.
+    The first lock file is open and locked; those of more directories name it.
     """
 
     def __init__(self) -> None:
@@ -106,7 +106,7 @@ class Locks:
 
         Args:
             folder: an existing directory, on a file system with POSIX locks.
-            waiting: called every half second while another writer is there; None fails at once instead.
+            waiting: called every half second while another writer is there; None: fail at once.
             path: the lock file; default: `LOCK` in the directory.
 
         Raises:
@@ -145,7 +145,7 @@ class Locks:
 
 
 def _lock(path: Path, folder: Path, waiting: Callable[[], object] | None) -> BinaryIO:
-    """Return the open and locked file, which names no other lock that is held."""
+    """Return the open, locked file, which names no other held lock."""
     while True:
         file = open_own(path, "ab+")
         try:
@@ -167,7 +167,7 @@ def _lock(path: Path, folder: Path, waiting: Callable[[], object] | None) -> Bin
 
 
 def _is_held_elsewhere(file: BinaryIO, path: Path) -> bool:
-    """Return whether a lock file names one that is held by whom it says."""
+    """Return whether a lock file names a lock that is held."""
     signature, found, name = _read(file).partition(BY_WAY_OF)
     if not found:
         return False
@@ -191,7 +191,7 @@ def _read(file: BinaryIO) -> bytes:
 
 
 def _holder(file: BinaryIO) -> str:
-    """Who has signed a lock file, and what to do about it."""
+    """Who has signed a lock file, and what to do."""
     signature = b""
     for _ in range(ATTEMPTS_TO_READ):  # it is signed right after it is locked
         signature = _read(file)
@@ -224,7 +224,7 @@ def _is_locked(file: BinaryIO) -> bool:
 
 
 def _is_still_there(file: BinaryIO, path: Path) -> bool:
-    """Whether its last holder has not removed it between our opening and locking it."""
+    """Whether the last holder has not removed it before we locked it."""
     try:
         return path.stat().st_ino == os.fstat(file.fileno()).st_ino
     except FileNotFoundError:
@@ -232,23 +232,23 @@ def _is_still_there(file: BinaryIO, path: Path) -> bool:
 
 
 def _sign(file: BinaryIO, content: bytes) -> None:
-    """Write who we are into a file that is locked."""
+    """Write who we are into a locked file."""
     file.truncate(0)
     file.write(content)
 
 
 OF_A_SWEEP = ("multirun.yaml", "optimization_results.yaml")
-"""What Hydra's sweepers leave beside run directories, and ``SWEEP/*`` names on a command line."""
+"""Files of Hydra's sweepers beside run directories, which ``SWEEP/*`` names too."""
 
 
 def without_sweeps_files(paths: Iterable[Path | str]) -> list[Path]:
-    """Return the paths of a command line but for Hydra's own files of a sweep; these too if there is nothing else."""
+    """Return the paths of a command line without Hydra's files of a sweep, unless there are no others."""
     every = list(map(Path, paths))
     return [path for path in every if path.name not in OF_A_SWEEP or path.is_dir()] or every
 
 
 def no_run(path: Path) -> str:
-    """Return why there is no run in or below a path."""
+    """Return why a path holds no run."""
     if path.is_dir():
         return f"{path} holds no run: no {LOG} in or below it"
     if not path.exists():

@@ -1,4 +1,4 @@
-"""A measurement: one line of a run's log, read without trust in who wrote it."""
+"""A measurement: one line of a run's log, checked as it may come from anyone."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from ctgraph_rl.checks import LARGEST_INT, NamedValues, ReadOnlyValues, is_int, 
 from ctgraph_rl.strict import MAX_NESTING, json_value
 
 MOST = 10**6
-"""Largest number of a block or task: tables are as long."""
+"""Largest number of a block or task: the length of tables."""
 
 MOST_FRAMES = 2**63 - 1
 
 LARGEST = 1e100
-"""Largest number that is measured: sums of squares of such numbers are finite."""
+"""Largest measured number: sums of squares stay finite."""
 
 
 def _is_number(value: object) -> bool:
@@ -27,7 +27,7 @@ def _is_text(value: object) -> bool:
 
 
 def _are(holds: Callable[[Any], bool], value: object) -> bool:
-    """Whether it is a list of values for which a rule holds."""
+    """Whether it is a list of values that obey a rule."""
     return isinstance(value, list) and all(map(holds, value))
 
 
@@ -36,23 +36,23 @@ def _is_task(value: object) -> bool:
 
 
 def _are_blocks(value: object) -> bool:
-    """Whether it lists for each block the numbers of its tasks."""
+    """Whether it lists each block's tasks by number."""
     return _are(lambda block: block != [] and _are(_is_task, block), value)
 
 
 def _are_sources(value: object) -> bool:
-    """Whether it has a text, or none, for each module."""
+    """Whether it has a text or None by module."""
     values = value.values() if isinstance(value, Mapping) else [] if value is None else [0]
     return all(each is None or isinstance(each, str) for each in values)
 
 
 def _are_seeds(value: object) -> bool:
-    """Whether it lists the seeds of a group."""
+    """Whether it lists a group's seeds."""
     return value is None or _are(is_int, value)
 
 
 def _is_expert(value: object) -> bool:
-    """Whether it says of a single-task expert at least its task."""
+    """Whether it says a single-task expert's task."""
     return isinstance(value, Mapping) and _is_task(value.get("task")) and _are_seeds(value.get("together"))
 
 
@@ -81,21 +81,21 @@ RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
         (_is_number, f"a number of at most {LARGEST:g}"),
     ),
 }
-"""Rules for the fields of a measurement."""
+"""Rules for fields."""
 
 NEEDED = {
     "training": ("block", "frames"),
     "evaluation": ("block", "frames", "task", "return_mean"),
     "adaptation": ("block", "frames", "task", "step", "return_mean"),
 }
-"""Fields of the kinds that tables are made of."""
+"""Fields of the kinds in tables."""
 
 
 def parsed(line: bytes) -> NamedValues:
     """The object of a line.
 
     Raises:
-        ValueError: for what is no object with a ``kind``, as the torn last line of a run that was killed.
+        ValueError: for anything but an object with a ``kind``, such as a torn last line.
     """
     measurement = json_value(line, finite=False)  # settings may be infinite
     if not (isinstance(measurement, dict) and "kind" in measurement):
@@ -107,11 +107,11 @@ def check(measurement: ReadOnlyValues, most: int = MOST) -> None:
     """Refuse a measurement that this package did not write.
 
     Args:
-        measurement: what `parsed` returned.
+        measurement: by `parsed`.
         most: number of blocks and of tasks that its file has room for.
 
     Raises:
-        ValueError: for a missing field, one of another type, and a number that tables have no room for.
+        ValueError: for a missing field, one of another type, and numbers too large for tables.
     """
     fields = []
     sizes = []
@@ -136,7 +136,7 @@ def check(measurement: ReadOnlyValues, most: int = MOST) -> None:
 
 
 def without_time(measurement: ReadOnlyValues) -> NamedValues:
-    """Return a measurement without its time, and without the directories of experts: equal in equal runs."""
+    """Return a measurement without time and experts' directories: equal in equal runs."""
     kept = {key: value for key, value in measurement.items() if key != "seconds"}
     if isinstance(kept.get("experts"), list):
         kept["experts"] = [_without_place(each) for each in kept["experts"]]
@@ -144,12 +144,12 @@ def without_time(measurement: ReadOnlyValues) -> NamedValues:
 
 
 def _without_place(expert: Any) -> Any:
-    """Return what the log says of an expert, but for its directory."""
+    """Return the log's facts on an expert, without its directory."""
     return {key: value for key, value in expert.items() if key != "run"} if isinstance(expert, dict) else expert
 
 
 def _numbers(measurement: ReadOnlyValues) -> Iterator[int]:
-    """Yield the numbers of blocks, tasks and episodes of a row."""
+    """Yield a row's numbers of blocks, tasks and episodes."""
     yield from (measurement[name] for name in ("block", "task", "step") if name in measurement)
     for block in measurement.get("trained", ()):
         yield from block

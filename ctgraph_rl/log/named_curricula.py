@@ -1,4 +1,4 @@
-"""The published curricula, which `curricula` has, by name."""
+"""The published curricula by name."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def curriculum_named(name: str) -> Curriculum:
     """Return a published curriculum.
 
     Raises:
-        ValueError: for an unknown name, with the choices; and see `check_packages`.
+        ValueError: for an unknown name, with the choices; and as `check_packages`.
     """
     check_packages()
     return import_module("curricula").load(name)

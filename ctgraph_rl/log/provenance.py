@@ -1,4 +1,4 @@
-"""Provenance: the versions and the machine that a run's numbers depend on, for the first line of its log."""
+"""Provenance: versions and machine that a run's numbers depend on, for the first line of its log."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from ctgraph_rl.portable import cpu_model, is_portable
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 NUMBERS = 2
-"""The numbers version of this package: raised when equal configurations and seeds give other weights or measurements.
+"""Numbers version: rises when equal configurations and seeds give other weights or measurements.
 
-Every run stores it. A log without it is of numbers version 1.
+A log without it has 1.
 """
 
 NUMBERS_TOGETHER = 3
-"""The numbers version of runs whose seeds were trained as one batch, which rose by what changed for these only."""
+"""Numbers version of seeds trained as one batch; rises for changes to these only."""
 
 
 def versions() -> dict[str, str]:
@@ -44,10 +44,10 @@ def versions() -> dict[str, str]:
 
 
 def is_published(curriculum: Curriculum) -> bool | None:
-    """Return whether a curriculum is the published one of its name; None if no published one has this name.
+    """Return whether a curriculum is the published one of its name; None if there is none.
 
     Raises:
-        ValueError: see `check_packages`.
+        ValueError: as `check_packages`.
     """
     check_packages()
     for name, _, _, _, fingerprint, _ in import_module("curricula").listed():
@@ -57,16 +57,13 @@ def is_published(curriculum: Curriculum) -> bool | None:
 
 
 def name_in_logs(curriculum: Curriculum) -> str:
-    """Return a curriculum's name, with ``(modified)`` behind it if another one is published under that name."""
+    """Return a curriculum's name, with ``(modified)`` behind it if a published one of that name differs."""
     return f"{curriculum.name} (modified)" if is_published(curriculum) is False else curriculum.name
 
 
 def provenance(curriculum: Curriculum, names: Iterable[str] | None = ()) -> NamedValues:
-    """Return curriculum, code, versions and machine as plain values for JSON. Tasks are counted from 1.
-
-    Args:
-        curriculum: what is learned.
-        names: see `code`.
+    """Return curriculum, code, versions and machine as plain values for JSON; tasks count from 1. ``names`` are as in
+    `code`.
     """
     return {
         "schema": SCHEMA,
@@ -84,12 +81,11 @@ def provenance(curriculum: Curriculum, names: Iterable[str] | None = ()) -> Name
 
 
 def code(curriculum: Curriculum, names: Iterable[str] | None = ()) -> NamedValues:
-    """Return what decides the numbers of a run beside its configuration, as plain values for JSON.
+    """Return what decides a run's numbers beside its configuration, as plain values for JSON.
 
     Args:
-        curriculum: what is learned; its fingerprint stands for it, and its parts of a user's classes count as names do.
-        names: classes and functions that learn, such as ``my_agent.MyAgent``, of which the user's sources count; None
-            if they are not known.
+        curriculum: counts by its fingerprint, and a user's classes of its parts as ``names`` do.
+        names: classes and functions that learn, such as ``my_agent.MyAgent``, whose user sources count; None: unknown.
     """
     known: dict[str, str | None] | None = None
     if names is not None:
@@ -99,9 +95,8 @@ def code(curriculum: Curriculum, names: Iterable[str] | None = ()) -> NamedValue
 
 
 def learners(config: ReadOnlyValues | None, agent: object) -> list[str]:
-    """Return the classes and functions that learn in a run: those of its configuration, or else the agent's parts.
-
-    The curriculum of a configuration is left out: what it is says its fingerprint, however it was made.
+    """Return the classes and functions that learn: of the configuration, without its curriculum, or else the agent's
+    parts.
     """
     named = list(targets({**(config or {}), "curriculum": None}))
     if named or agent is None:
@@ -114,7 +109,7 @@ def learners(config: ReadOnlyValues | None, agent: object) -> list[str]:
 
 
 def _parts(value: Any) -> Iterator[str]:
-    """Yield the names of the user's classes that parts of a curriculum have."""
+    """Yield the names of users' classes of a curriculum's parts."""
     if is_dataclass(value) and not isinstance(value, type):
         if not is_ours(type(value).__module__):
             yield full_name(type(value))
@@ -126,7 +121,7 @@ def _parts(value: Any) -> Iterator[str]:
 
 
 def code_changes(before: ReadOnlyValues, now: ReadOnlyValues) -> list[str]:
-    """Return in words what differs in the `code` of two runs; what one of them does not know does not differ.
+    """Return in words what differs in two runs' `code`, where both know it.
 
     Args:
         before: the first line of a log.
@@ -149,20 +144,20 @@ def code_changes(before: ReadOnlyValues, now: ReadOnlyValues) -> list[str]:
 
 
 def is_unknown(before: ReadOnlyValues, now: ReadOnlyValues) -> bool:
-    """Return whether a run does not say of which source it is where that counts now."""
+    """Return whether a run lacks the source that counts now."""
     stored = before.get("sources")
     return bool(now["sources"]) and (stored is None or None in stored.values())
 
 
 def numbers_of(about: ReadOnlyValues) -> int:
-    """Return the numbers version that this package gives a run, by the first line of its log."""
+    """Return the numbers version that this package gives a run, by its log's first line."""
     return NUMBERS_TOGETHER if about.get("together") else NUMBERS
 
 
 def machine() -> NamedValues:
-    """Return what besides versions decides the bits of a run on a CPU: its kind and the number of threads.
+    """Return what decides a run's bits on a CPU: its threads and kind, such as ``x86_64 AVX512``.
 
-    The kind is such as ``x86_64 AVX512``, or ``x86_64 portable`` for any CPU of `ctgraph_rl.portable`.
+    The kind is ``x86_64 portable`` for any CPU of `ctgraph_rl.portable`.
     """
     instructions = "portable" if is_portable() else torch.backends.cpu.get_cpu_capability()
     kind = f"{platform.machine()} {instructions}"
@@ -170,7 +165,7 @@ def machine() -> NamedValues:
 
 
 def targets(settings: Any) -> Iterator[str]:
-    """Yield the names of classes and functions that a configuration builds or hands on, at any depth."""
+    """Yield the classes and functions that a configuration names, at any depth."""
     if isinstance(settings, Mapping):
         name = str(settings.get("_target_", ""))
         if name:

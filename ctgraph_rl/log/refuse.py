@@ -1,4 +1,4 @@
-"""How commands end: with a message on what the user asked for, or quietly once their output has no reader."""
+"""How commands end: with a message for the user, or quietly without a reader of their output."""
 
 from __future__ import annotations
 
@@ -13,10 +13,7 @@ from ctgraph_rl.log.escape import terminal_lines
 
 @contextmanager
 def refused_by(parser: argparse.ArgumentParser) -> Iterator[None]:
-    """Turn an error of the user into one message and exit code 2.
-
-    A broken pipe is no such error.
-    """
+    """Turn a user's error, but no broken pipe, into one message and exit code 2."""
     try:
         yield
     except BrokenPipeError:
@@ -27,7 +24,7 @@ def refused_by(parser: argparse.ArgumentParser) -> Iterator[None]:
 
 @contextmanager
 def quiet_where_nobody_reads() -> Iterator[None]:
-    """Exit with code 1 and without a word once standard output has no reader, as in ``ctgraph-rl results | head``."""
+    """Exit quietly with code 1 once standard output has no reader, as in ``ctgraph-rl results | head``."""
     try:
         yield
         if sys.stdout is not None:
@@ -40,7 +37,7 @@ def quiet_where_nobody_reads() -> Iterator[None]:
 
 
 def _has_reader() -> bool:
-    """Return whether it was another pipe that broke than standard output's; an empty line there finds out."""
+    """Return whether standard output still has a reader, by an empty line."""
     try:
         print(flush=True)
     except BrokenPipeError:

@@ -6,17 +6,16 @@ Every line is one JSON object with a ``kind``. Schema 1:
   block, such as ``[[1], [2]]``.
 - ``training``: one interval of a block: ``block`` from 1, ``frames`` of the run so far, finished ``episodes`` and their
   ``return_mean``, ``success_rate``, ``end_rate`` (the share that reached an end state) and ``length_mean``; what the
-  agent reports of the batch. A batch that goes over a hidden boundary is a line for each block, and an episode counts
-  where it ends, though its task may be that of the block before.
-- ``evaluation``: means over the evaluation episodes of one task. ``moment`` says when: ``before`` any training (block
-  0), ``during`` a block, or ``after`` it. ``task`` counts the curriculum's tasks from 1; held-out tasks, marked
-  ``held_out``, count on from there.
+  agent reports. A batch over a hidden boundary has a line per block; an episode counts where it ends.
+- ``evaluation``: means over the evaluation episodes of one task. ``moment`` is ``before`` any training (block 0),
+  ``during`` a block, or ``after`` it. ``task`` counts the curriculum's tasks from 1, then the held-out ones, marked
+  ``held_out``.
 - ``adaptation``: where rows adapt before an evaluation, means over the rows' episodes number ``step``, from 1, and
   ``found_rate``, the share of rows that have reached the goal by then; ``exact_rate``, the success rate of the best
   search; else as ``evaluation``.
 
-Numbers that are not finite, as means of no episodes, are null. ``seconds`` is the time since the start of the run, and
-the only field that differs between two equal runs. A reader in three lines, for what `RunLog.read` does not give::
+Numbers that are not finite are null. Only ``seconds``, the time since the start, differs between two equal runs. A
+reader in three lines, for what `RunLog.read` does not give::
 
     import json
     with open("run.jsonl", encoding="utf-8") as file:
@@ -45,34 +44,34 @@ from ctgraph_rl.metrics import Column, Curves, Regime, RegimeTable, Trained
 from ctgraph_rl.metrics.adaptation import Adaptation
 
 MOST_CELLS = 10**7
-"""Largest table that is made of a log."""
+"""Largest table of a log."""
 
 MOST_BYTES = 2**30
-"""Largest log that is read: 1 GiB."""
+"""Largest log, 1 GiB."""
 
 MOST_MEMORY, BYTES_OF_A_VALUE = 2**32, 100
-"""Memory that a log may take, 4 GiB, and bytes for each of its values: small records take many times their size."""
+"""Memory of a log, 4 GiB, and bytes per value, as small records grow many times."""
 
 VALUES = (b",", b":", b"{", b"[", b"\n")
-"""What stands between values of JSON."""
+"""Stands between JSON values."""
 
 FEW, BYTES_OF_A_NUMBER = 1000, 4
-"""Blocks and tasks that a log of any size may have, and bytes of its file for each more."""
+"""Blocks and tasks of a log of any size, and file bytes for each more."""
 
 FEW_CELLS, CELLS_OF_A_BYTE = 10**4, 16
-"""Cells that a table of a log of any size may have, and more for each byte of its file."""
+"""Cells of a table of a log of any size, and more per file byte."""
 
 SCHEMA = 1
-"""Raised when the meaning of a line changes; fields may be added without."""
+"""Rises when the meaning of a line changes; fields may be added without."""
 
 BEGINNING = b'{"kind": "run"'
-"""Of the first line of a run's log."""
+"""Of a log's first line."""
 
 
 class RunLog:
-    """Measurements of one run, in memory and, with a path, in a file that is written line by line.
+    """Measurements of one run, in memory and, with a path, in a file, line by line.
 
-    ``listeners`` are called with every measurement that is appended.
+    ``listeners`` are called with every new measurement.
 
     Args:
         path: the file to append to; None keeps measurements in memory only.
@@ -94,25 +93,24 @@ class RunLog:
                 self._write_to(file)
 
     def _write_to(self, file: BinaryIO) -> None:
-        """Append to a file from now on. It is opened for each line: thousands of logs can be written at once."""
+        """Append to a file from now on, opened for each line, so that thousands of logs can be written at once."""
         self._path = Path(os.fsdecode(file.name)).absolute()  # a program may change its directory
         self._found = os.fstat(file.fileno())
 
     def __repr__(self) -> str:
-        """Return the curriculum, the seed and how much was measured, in one line."""
         run = self._run()
         counts = f"{len(self.of_kind('training'))} training intervals, {len(self.of_kind('evaluation'))} evaluations"
         return f"<RunLog {run['curriculum']!s:.80}, seed {run['seed']}: {counts}>"
 
     def _run(self) -> NamedValues:
-        """Return curriculum, fingerprint and seed, None where the log does not say them."""
+        """Return curriculum, fingerprint and seed, None if unknown."""
         about = (self.of_kind("run") or [{}])[0]
         seed = (about.get("config") or {}).get("seed")
         return {"curriculum": about.get("curriculum"), "fingerprint": about.get("fingerprint"), "seed": seed}
 
     @classmethod
     def resume(cls, path: Path | str, position: Mapping[str, float]) -> RunLog:
-        """Resume writing a log from a `position`; the lines after it are removed.
+        """Resume a log from a `position`, removing later lines.
 
         Raises:
             ValueError: if the file ends before it, or a line is no measurement.
@@ -131,11 +129,11 @@ class RunLog:
         return log
 
     def position(self) -> dict[str, float]:
-        """Return the length of the file, in bytes that have reached the disk, and the time of the run, in seconds."""
+        """Return the file's bytes on disk, and the run's seconds."""
         return {"bytes": self.sync(), "seconds": round(time.perf_counter() - self._start, 3)}
 
     def sync(self) -> int:
-        """Let the lines so far reach the disk; return the length of the file, in bytes."""
+        """Let all lines reach the disk; return the file's bytes."""
         if self._path is None or self._is_closed:
             return 0
         with appending(self._path, self._found) as descriptor:
@@ -150,7 +148,7 @@ class RunLog:
         """Add one measurement; NaN and infinity become null, as JSON has neither.
 
         Raises:
-            OSError: if it cannot be written, and where the file has been moved.
+            OSError: if it cannot be written, or the file was moved.
         """
         finite = {name: _finite(value) for name, value in values.items()}
         measurement = {"kind": kind, **finite, "seconds": round(time.perf_counter() - self._start, 3)}
@@ -179,17 +177,17 @@ class RunLog:
     def read(cls, path: Path | str) -> RunLog:
         """The log of a run directory's ``run.jsonl``, in memory.
 
-        A last line that was torn when the run was killed is left out and counted in ``torn_lines``.
+        A torn last line of a killed run is left out and counted in ``torn_lines``.
 
         Raises:
-            ValueError: for any other line that is no measurement, for a newer schema, for what is no regular file of at
-                most `MOST_BYTES`, and for numbers of blocks and tasks that a file of its size cannot measure.
+            ValueError: for any other line that is no measurement, a newer schema, anything but a regular file of at
+                most `MOST_BYTES`, and more blocks and tasks than a file of its size can measure.
         """
         return cls.of_content(read_regular(as_path("path", path), MOST_BYTES), path)
 
     @classmethod
     def of_content(cls, content: bytes, path: Path | str) -> RunLog:
-        """Return the log whose file has this content; see `read`. Errors name ``path``."""
+        """Return the log of a file's content, as `read`. Errors name ``path``."""
         needed = len(content) + BYTES_OF_A_VALUE * sum(map(content.count, VALUES))
         require((needed <= MOST_MEMORY, f"{path} would take {needed:,} bytes of memory, the limit is {MOST_MEMORY:,}"))
         *lines, last = content.split(b"\n")
@@ -209,7 +207,7 @@ class RunLog:
         return log
 
     def _check(self, path: Path | str) -> None:
-        """Refuse what this version has not written; errors name ``path``."""
+        """Refuse logs that this version has not written; errors name ``path``."""
         most = FEW + self._num_bytes // BYTES_OF_A_NUMBER
         for number, measurement in enumerate(self.measurements, 1):
             try:
@@ -223,7 +221,7 @@ class RunLog:
 
     @classmethod
     def begun(cls, path: Path | str) -> NamedValues | None:
-        """Return the first line of a run's log, None where it has none; what follows it may be anything."""
+        """Return a log's first line, or None; what follows may be anything."""
         try:
             first = parsed(read_regular(path, MOST_BYTES).partition(b"\n")[0])
             check(first)
@@ -233,7 +231,7 @@ class RunLog:
 
     @classmethod
     def is_blank(cls, path: Path | str) -> bool:
-        """Return whether a log holds no more than a part of its first line, as where the machine stopped early."""
+        """Return whether a log holds at most a part of its first line, as after an early crash."""
         try:
             content = read_regular(path, MOST_BYTES).strip(b"\0")
         except ValueError:
@@ -245,7 +243,7 @@ class RunLog:
         return [measurement for measurement in self.measurements if measurement["kind"] == kind]
 
     def rows(self, kind: str) -> Iterator[NamedValues]:
-        """Yield the measurements of a kind, after the curriculum, the fingerprint and the seed of the run."""
+        """Yield the measurements of a kind, after the run's curriculum, fingerprint and seed."""
         run = self._run()
         for measurement in self.of_kind(kind):
             row = {**run, **measurement}
@@ -253,10 +251,7 @@ class RunLog:
             yield row
 
     def to_pandas(self, kind: str = "evaluation") -> Any:
-        """Return the measurements of a kind as a ``pandas.DataFrame``, one row each; see `rows`.
-
-        Args:
-            kind: ``evaluation`` or ``training``.
+        """Return `rows` of a kind, ``evaluation`` or ``training``, as a ``pandas.DataFrame``.
 
         Raises:
             ModuleNotFoundError: without pandas.
@@ -268,12 +263,12 @@ class RunLog:
         return pandas.DataFrame(list(self.rows(kind)))
 
     def performance(self, num_tasks: int = 0) -> Tensor:
-        """The performance matrix: mean return, float64 [blocks + 1, tasks]; NaN where not, or not yet, evaluated.
+        """The performance matrix: mean return, float64 [blocks + 1, tasks]; NaN where not evaluated.
 
-        Blocks and tasks are those that the log says are trained; where it does not say, those so far.
+        Blocks and tasks are the log's trained ones, or else those so far.
 
         Args:
-            num_tasks: columns that there are at least, for tasks that were never evaluated.
+            num_tasks: least columns, for tasks never evaluated.
         """
         num_rows = max(len(self.ends()), 1 + len(self._said()))
         rows: dict[int, dict[int, float]] = {block: {} for block in range(num_rows)}
@@ -282,7 +277,7 @@ class RunLog:
         return self._matrix(rows.values(), num_tasks)
 
     def ends(self) -> list[int]:
-        """Frames of the run at the end of each block so far; 0 for block 0, before any training."""
+        """Frames of the run at the end of each block so far; 0 for block 0."""
         ends = {0: 0}
         for m in self.measurements:
             if m["kind"] in ("training", "evaluation"):
@@ -290,7 +285,7 @@ class RunLog:
         return [ends.get(block, 0) for block in range(max(ends) + 1)]
 
     def training(self, name: str, block: int | None = None) -> Tensor:
-        """A field of the training intervals, of one block or of all, float64 [intervals]; NaN where it is null."""
+        """A field of the training intervals of one block or all, float64 [intervals]; NaN for null."""
         return _row([m.get(name) for m in self.of_kind("training") if block in (None, m["block"])])
 
     def training_by_block(self, name: str) -> dict[int, Tensor]:
@@ -301,23 +296,18 @@ class RunLog:
         return {block: _row(of_block) for block, of_block in values.items()}
 
     def last(self, name: str, num_tasks: int = 0) -> Tensor:
-        """A field of the evaluation of each task after the last block, float64 [tasks]; NaN where there is none.
-
-        The last block is that of the curriculum, where the log says it.
+        """A field of each task's evaluation after the curriculum's last block, float64 [tasks], or NaN.
 
         Args:
             name: the field.
-            num_tasks: see `performance`.
+            num_tasks: as in `performance`.
         """
         evaluations = self._evaluations(during=False)
         block = len(self._said()) or max((m["block"] for m in evaluations), default=0)
         return self._matrix([{m["task"]: m.get(name) for m in evaluations if m["block"] == block}], num_tasks)[0]
 
     def adaptation(self, held_out: bool = False) -> Adaptation | None:
-        """Return the last evaluation with adaptation; None where there is none.
-
-        Args:
-            held_out: of held-out tasks, else of trained ones.
+        """Return the last evaluation with adaptation, of held-out or trained tasks, or None.
 
         Raises:
             ValueError: if tasks differ in the number of episodes.
@@ -341,7 +331,7 @@ class RunLog:
         """All evaluations of the curriculum's tasks in time order, those during blocks included.
 
         Args:
-            trained: for each block, its tasks counted from 0; default: as the log says.
+            trained: each block's tasks, from 0; default: the log's.
             name: the field that is the performance.
 
         Raises:
@@ -363,16 +353,15 @@ class RunLog:
     def regime_table(self, trained: Trained | None = None, labels: Sequence[str] | None = None) -> RegimeTable:
         """The run as the lifelong metrics see it: a regime per training block and per evaluation at its boundaries.
 
-        An experience is a training interval with finished episodes. Evaluations during blocks and of held-out tasks
-        are left out.
+        An experience is a training interval with finished episodes. Evaluations during blocks or held out do not count.
 
         Args:
-            trained: for each block, its tasks counted from 0; default: as the log says.
-            labels: the name of each task; default: as its evaluations say, ``task 1`` and so on where they do not.
+            trained: each block's tasks, from 0; default: the log's.
+            labels: tasks' names; default: those of evaluations, else ``task 1`` and so on.
 
         Raises:
-            ValueError: for a block that trains several tasks, whose effects cannot be separated, one without a
-                finished episode, and a task that was never evaluated.
+            ValueError: for a block that trains several tasks, one without a finished episode, and a task never
+                evaluated.
         """
         tasks = []
         mixed = []
@@ -394,7 +383,7 @@ class RunLog:
         return RegimeTable([*names], Column(*zip(*rows, strict=True)), _row(values))
 
     def _stays(self, tasks: Sequence[int]) -> Iterator[tuple[int, bool, list[float | None]]]:
-        """Yield the number of the task, whether it is trained and the returns of each regime of a run."""
+        """Yield each regime's task number, whether it trains, and its returns."""
         at_end: dict[int, list[NamedValues]] = {}
         for m in self._evaluations(during=False):
             at_end.setdefault(m["block"], []).append(m)
@@ -413,14 +402,14 @@ class RunLog:
         return tuple(map(tuple, trained))
 
     def _said(self) -> list[list[int]]:
-        """The tasks of each block, counted from 0, if the first line says them."""
+        """Each block's tasks, from 0, if the first line says them."""
         for run in self.of_kind("run"):
             if "trained" in run:
                 return [[number - 1 for number in block] for block in run["trained"]]
         return []
 
     def _evaluations(self, during: bool) -> list[NamedValues]:
-        """Evaluations of the curriculum's own tasks."""
+        """Evaluations of the curriculum's tasks."""
         found = []
         for m in self.of_kind("evaluation"):
             if not m.get("held_out") and (during or m.get("moment") != "during"):
@@ -428,7 +417,7 @@ class RunLog:
         return found
 
     def _matrix(self, rows: Iterable[Mapping[int, float | None]], num_tasks: int) -> Tensor:
-        """Rows of values by task number, NaN where a row has none."""
+        """Rows of values by task number, else NaN."""
         evaluated = {m["task"] for m in self._evaluations(during=True)}
         tasks = range(1, max(num_tasks, 1 + max(chain(*self._said()), default=-1), *evaluated) + 1)
         rows = list(rows)
@@ -439,7 +428,7 @@ class RunLog:
 
 
 def label_of(evaluation: ReadOnlyValues) -> str:
-    """Return the name of the task of an evaluation: its label, or its number where it has none."""
+    """Return the label, or else the number, of an evaluation's task."""
     return str(evaluation.get("label", f"task {evaluation['task']}"))
 
 
@@ -452,12 +441,9 @@ def _finite(value: Any) -> Any:
 
 
 def write_performance(path: Path | str, log: RunLog, labels: Iterable[str]) -> None:
-    """Write the performance matrix as CSV: one line per block so far, block 0 before any training.
+    """Write the performance matrix as CSV: a line per block so far, block 0 before any training.
 
-    Args:
-        path: file to write.
-        log: the run's log.
-        labels: a name per task, the last columns.
+    ``labels`` name the tasks, the last columns.
     """
     lines: list[list[Any]] = [["block", "frames", *labels]]
     for block, (frames, row) in enumerate(zip(log.ends(), log.performance().tolist(), strict=False)):
@@ -466,14 +452,11 @@ def write_performance(path: Path | str, log: RunLog, labels: Iterable[str]) -> N
 
 
 def write_metrics(path: Path | str, metrics: ReadOnlyValues) -> None:
-    """Write metrics as JSON: for each name the value, its definition, formula and source, or why it is undefined.
-
-    One run is one seed, and has no interval; `ctgraph_rl.report.results` has those of several.
-    """
+    """Write metrics as JSON: by name the value, definition, formula and source, or why it is undefined."""
     write_whole(path, metrics_text(metrics))
 
 
 def metrics_text(metrics: ReadOnlyValues) -> bytes:
-    """Return the content of a file of metrics."""
+    """Return the content of `METRICS`."""
     content = {name: {**vars(metric), "n_seeds": 1, "interval": None} for name, metric in metrics.items()}
     return (json.dumps(content, indent=2) + "\n").encode()

@@ -1,4 +1,4 @@
-"""What `torch.save` wrote, of tensors and plain values, read without running code or taking more than its size."""
+"""Tensors and plain values of `torch.save`, read without running code or taking more memory than their size."""
 
 from __future__ import annotations
 
@@ -19,34 +19,34 @@ from ctgraph_rl.checks import memory_bytes, require
 from ctgraph_rl.disk import read_regular
 
 SHARE_OF_MEMORY = 4
-"""Files may have this part of the machine's memory: one is read, checked, made tensors and copied into an agent."""
+"""Part of the machine's memory for a file, which is read, checked, made tensors and copied."""
 
 _GLOBALS = re.compile(
     r"torch\._utils _rebuild_(tensor_v2|parameter|parameter_with_state)"
     r"|torch \w+Storage|torch\.storage UntypedStorage|torch [a-z]\w*\d\w*|torch (bool|device|Size)"
     r"|collections OrderedDict|_codecs encode|(__builtin__|builtins) (set|complex)"
 )
-"""What a pickle of tensors and plain values names; `torch.load` by itself also lets it make arrays of any size."""
+"""Names in a pickle of tensors and plain values; `torch.load` by itself also makes arrays of any size."""
 
 _FOLLOWS = {"_codecs encode": "BINUNICODE", "collections OrderedDict": "EMPTY_TUPLE"}
-"""What these are called with, so that no result is made larger again and again."""
+"""Arguments of these, so that no result grows again and again."""
 
 
 def read_content(path: Path) -> bytes:
     """Return the content of a regular file that fits this machine.
 
     Raises:
-        ValueError: for a larger file, and what is no regular file.
+        ValueError: for a larger file, or no regular one.
         OSError: if it cannot be read.
     """
     return read_regular(path, memory_bytes() // SHARE_OF_MEMORY)
 
 
 def read_plain(content: bytes) -> Any:
-    """Read what `torch.save` made of tensors and plain values, on the CPU; nothing else is built, and no code runs.
+    """Read tensors and plain values of `torch.save`, on the CPU; nothing else is built, and no code runs.
 
     Raises:
-        ValueError: for anything else, and for what would take more memory than a few times its size.
+        ValueError: for anything else, and for values that take many times the file's size in memory.
     """
     require_records(content)
     try:
@@ -58,10 +58,10 @@ def read_plain(content: bytes) -> Any:
 
 
 def _require_small(value: Any, num_bytes: int) -> None:
-    """Refuse what is small in the file and large where it is used: parts that stand in many places, and long strides.
+    """Refuse values that are small in the file and large in use: repeated parts and long strides.
 
     Raises:
-        ValueError: for more parts than the file has bytes, and for tensors that would not fit this machine.
+        ValueError: for more parts than the file has bytes, and tensors beyond this machine's memory.
     """
     parts = [value]
     count = 0
@@ -83,10 +83,7 @@ def _require_small(value: Any, num_bytes: int) -> None:
 
 
 def sum_of_state(state: Any) -> str:
-    """Return the SHA-256 of tensors and plain values: names, types, shapes and bits, in the order of their names.
-
-    It does not depend on how a version of `torch.save` writes them.
-    """
+    """Return the SHA-256 of tensors and plain values: names, types, shapes and bits, however saved."""
     found = hashlib.sha256()
     for name, value in sorted(_leaves(state), key=itemgetter(0)):
         found.update(f"{name}\n{_described(value)}\n".encode("utf-8", "backslashreplace"))
@@ -96,17 +93,17 @@ def sum_of_state(state: Any) -> str:
 
 
 def count_bytes(state: Any) -> int:
-    """Return the bytes of all tensors of a state."""
+    """Return the bytes of a state's tensors."""
     return sum(value.nbytes for _, value in _leaves(state) if isinstance(value, torch.Tensor))
 
 
 def view_bits(tensor: torch.Tensor) -> torch.Tensor:
-    """Return the bytes of a tensor, uint8 [bytes], on the CPU."""
+    """Return a tensor's bytes, uint8 [bytes], on the CPU."""
     return tensor.detach().cpu().contiguous().view(-1).view(torch.uint8)
 
 
 def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the tensors, plain values and empty parts within a value, each by its place."""
+    """Yield the tensors, plain values and empty parts of a value, by place."""
     if isinstance(value, Mapping) and value:
         for key, item in value.items():
             yield from _leaves(item, f"{name}/{key!r}")
@@ -118,17 +115,17 @@ def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _described(value: Any) -> str:
-    """Return type and shape of a tensor, and a plain value with its type."""
+    """Return a tensor's type and shape, or a plain value and its type."""
     is_tensor = isinstance(value, torch.Tensor)
     return f"{value.dtype} {list(value.shape)}" if is_tensor else f"{type(value).__name__} {value!r}"
 
 
 def require_records(content: bytes) -> None:
-    """Refuse records that would take more than they have in the file, before any is read.
+    """Refuse records that would take more memory than file, before any is read.
 
     Raises:
-        ValueError: for what is no archive as `torch.save` writes it: one that ends with the list of its records, which
-            are not compressed and do not overlap; and for a pickle that names other than tensors and plain values.
+        ValueError: for other archives than of `torch.save`, which end with the list of their records, uncompressed and
+            without overlap; and for pickles that name more than tensors and plain values.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as records:
@@ -144,7 +141,7 @@ def require_records(content: bytes) -> None:
 
 
 def _check_sizes(content: bytes, records: list[zipfile.ZipInfo]) -> None:
-    """Refuse compressed and overlapping records, and a second list of records that another reader could take."""
+    """Refuse compressed or overlapping records, and a second list of records."""
     end = len(content) - 22
     large = content[end - 20 : end - 16] == b"PK\x06\x07"
     one_list = (
@@ -163,7 +160,7 @@ def _check_sizes(content: bytes, records: list[zipfile.ZipInfo]) -> None:
 
 
 def _names(pickled: bytes) -> Iterator[tuple[str, str]]:
-    """Yield what a pickle names, each with the kind of what follows."""
+    """Yield a pickle's names, each with the kind of what follows."""
     known: dict[Any, str] = {}
     name = ""
     last = ""
@@ -178,7 +175,7 @@ def _names(pickled: bytes) -> Iterator[tuple[str, str]]:
 
 
 def _named(operation: str, argument: Any, known: dict[Any, str]) -> str:
-    """Return the name that an operation puts on the stack; empty for a plain value."""
+    """Return the name that an operation stacks; empty for a plain value."""
     if operation == "GLOBAL":
         return argument
     if operation in ("STACK_GLOBAL", "INST", "EXT1", "EXT2", "EXT4", "OBJ", "MEMOIZE"):

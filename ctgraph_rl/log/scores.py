@@ -1,4 +1,4 @@
-"""All metrics of a run: what its curriculum, its log and, where there are any, its experts say."""
+"""All metrics of a run, from its curriculum, its log and its experts."""
 
 from __future__ import annotations
 
@@ -37,22 +37,22 @@ GOAL_CHANGES = Undefined("ceilings are exact only for goals that stay, and a tas
 NO_EXPERTS = "no experts were given"
 AT_MOMENTS = "evaluate exactly where Curriculum.moments says"
 MOST_MOMENTS = 5
-"""Moments that a reason names."""
+"""Most moments that a reason names."""
 
 
 def scores(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None = None) -> dict[str, Metric]:
     """Every metric by name, those of `metrics.summary` first; undefined with the reason where it has no value.
 
-    The lifelong metrics are on the scale of l2metrics, 1..101, with each task's known range: 1 is its ``fail_reward``,
-    101 its optimal value. Of tasks that are no CT-graphs, 1 is the lowest return.
+    The lifelong metrics are on the scale of l2metrics: 1 is a task's ``fail_reward``, or the lowest return if it is no
+    CT-graph, and 101 its optimal value.
 
     Args:
         log: a whole run.
         curriculum: what was learned.
-        experts: for each of ``curriculum.tasks``, the log of an agent that learned only this task.
+        experts: for each of ``curriculum.tasks``, the log of its single-task expert.
 
     Raises:
-        ValueError: for the log of another curriculum, by its fingerprint, and another number of experts.
+        ValueError: for the log of another curriculum, or another number of experts.
 
     Example:
         >>> import curricula
@@ -70,9 +70,9 @@ def scores(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None
 
 
 def inputs_of(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None) -> NamedValues:
-    """Return all of `ctgraph_rl.metrics.inputs.INPUTS`, `Undefined` in place of what this run does not give.
+    """Return all of `ctgraph_rl.metrics.inputs.INPUTS`, `Undefined` if this run lacks one.
 
-    A run that is not finished gives nothing of what it measured.
+    An unfinished run has measured nothing.
     """
     facts = _facts(curriculum)
     try:
@@ -83,7 +83,7 @@ def inputs_of(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | N
 
 
 def check_finished(log: RunLog, curriculum: Curriculum) -> None:
-    """Refuse the log of a run without the last evaluation of its curriculum's protocol.
+    """Refuse a log without the protocol's last evaluation.
 
     Raises:
         ctgraph_rl.metrics.Undefined: says how far it came.
@@ -95,12 +95,12 @@ def check_finished(log: RunLog, curriculum: Curriculum) -> None:
 
 
 def protocol_curves(log: RunLog, curriculum: Curriculum) -> Curves:
-    """Return the evaluation curves of a finished run that was evaluated where the protocol says, and nowhere else.
+    """Return the curves of a finished run that was evaluated exactly where the protocol says.
 
-    Areas, sums and maxima over evaluations of two runs compare only then.
+    Only then areas, sums and maxima of two runs compare.
 
     Raises:
-        ctgraph_rl.metrics.Undefined: for another run; names the moments that are missing, or too many.
+        ctgraph_rl.metrics.Undefined: names missing and extra moments.
     """
     check_finished(log, curriculum)
     found = {m["frames"] for m in log.of_kind("evaluation") if not m.get("held_out")}
@@ -114,7 +114,7 @@ def protocol_curves(log: RunLog, curriculum: Curriculum) -> Curves:
 
 
 def _facts(curriculum: Curriculum) -> NamedValues:
-    """Return the inputs that are known before a run."""
+    """Return the inputs known before a run."""
     tasks = curriculum.tasks
     known = {
         "trained": curriculum.trained,
@@ -139,13 +139,13 @@ OF_GRAPHS = (
     *(f"{policy}_entropies" for policy in POLICIES),
     *("random_frames", "search_episodes"),
 )
-"""Inputs that only CT-graphs have."""
+"""Inputs of CT-graphs only."""
 
 
 def _measured(
     log: RunLog, curriculum: Curriculum, best: Tensor | Undefined, experts: Sequence[RunLog] | None
 ) -> NamedValues:
-    """Return the inputs that a finished run has measured."""
+    """Return the inputs that a finished run measured."""
     count = len(curriculum.tasks)
     curves: Curves | Undefined
     mastery: Curves | Undefined
@@ -174,11 +174,11 @@ OF_TRAINING = (
     *("episodes", "returns", "labelling", "interval_best"),
     *("first_frames", "first_episodes", "first_success_rates"),
 )
-"""Inputs that training intervals give."""
+"""Inputs by training intervals."""
 
 
 def _training(log: RunLog, curriculum: Curriculum, best: Tensor | Undefined) -> NamedValues:
-    """Return the inputs that training intervals give, which must reach to the end of the curriculum."""
+    """Return the inputs by training intervals, which must reach the curriculum's end."""
     reached = max((m["frames"] for m in log.of_kind("training")), default=0)
     if 0 < reached < curriculum.num_frames:
         reason = Undefined(
@@ -195,7 +195,6 @@ def _training(log: RunLog, curriculum: Curriculum, best: Tensor | Undefined) -> 
 
 
 def _adaptation(log: RunLog, held_out: bool) -> Adaptation | Undefined:
-    """Return the curves of the last evaluation with adaptation, or why there are none."""
     found = log.adaptation(held_out)
     which = "held-out" if held_out else "trained"
     return found or Undefined(f"no {which} task was evaluated with evaluation.adapt_episodes > 0")
@@ -206,7 +205,7 @@ def _kind(tasks: Sequence[TaskLike]) -> str:
 
 
 def _check_same(log: RunLog, curriculum: Curriculum) -> None:
-    """The curriculum must be what was learned, as far as the log's first line says."""
+    """Refuse another curriculum than the log's first line says."""
     given = curriculum.fingerprint
     for run in log.of_kind("run"):
         learned = run.get("fingerprint", given)
@@ -220,9 +219,9 @@ def _check_same(log: RunLog, curriculum: Curriculum) -> None:
 
 
 def optimal_values(tasks: Sequence[TaskLike]) -> Tensor | Undefined:
-    """Each task's best mean return, float64 [tasks]; NaN where a graph is too large to know.
+    """Each task's best mean return, float64 [tasks]; NaN where a graph is too large.
 
-    Of tasks that are no CT-graphs, the reason where one does not know it.
+    The reason, where a task that is no CT-graph does not know it.
     """
     if not are_graphs(tasks):
         return _said_by(tasks, "optimal_value", lambda task: task.optimal_value(1.0))
@@ -230,7 +229,7 @@ def optimal_values(tasks: Sequence[TaskLike]) -> Tensor | Undefined:
 
 
 def ceilings(tasks: Sequence[Task]) -> dict[str, Tensor | Undefined]:
-    """Return exact ceilings of each task and what its observations tell, float64 [tasks], or why one is not known."""
+    """Return each task's exact ceilings and what observations tell, float64 [tasks], or why one is not known."""
     known: dict[str, Tensor | Undefined] = {
         "open_loop_ceilings": _of_each(open_loop_ceiling, tasks),
         "memoryless_ceilings": _of_each(memoryless_ceiling, tasks),
@@ -243,21 +242,21 @@ def ceilings(tasks: Sequence[Task]) -> dict[str, Tensor | Undefined]:
 
 
 def lowest_returns(tasks: Sequence[TaskLike]) -> Tensor | Undefined:
-    """Each task's return of a failure, of others than CT-graphs the lowest return, float64 [tasks]."""
+    """Each task's return of a failure, or lowest return if no CT-graph, float64 [tasks]."""
     if not are_graphs(tasks):
         return _said_by(tasks, "return_bounds", lambda task: task.return_bounds[0])
     return float64([task.fail_reward for task in tasks])
 
 
 def _said_by(tasks: Sequence[TaskLike], member: str, value: Callable[[Any], float]) -> Tensor | Undefined:
-    """Return a value that tasks may know themselves by an optional member, or why one does not."""
+    """Return an optional member's value of each task, or why one does not know it."""
     if not hasattr(type(tasks[0]), member):
         return Undefined(f"{_kind(tasks)} has no {member}, so it is not known")
     return _of_each(value, tasks)
 
 
 def _of_each(value: Callable[[Any], float], tasks: Sequence[Any]) -> Tensor | Undefined:
-    """Return a value of each task; the reason of the first that has none."""
+    """Return each task's value, or the reason of the first that has none."""
     try:
         return float64(list(map(value, tasks)))
     except ValueError as error:
@@ -267,9 +266,9 @@ def _of_each(value: Callable[[Any], float], tasks: Sequence[Any]) -> Tensor | Un
 def mastery_thresholds(tasks: Sequence[TaskLike]) -> Tensor | Undefined:
     """From which value on each task is mastered, float64 [tasks]; NaN as for `optimal_values`.
 
-    Without noise of rewards it is a mean return: `metrics.MASTERED` times a positive optimal value, and that share of
-    the way from the worst possible mean return to any other, so that the optimal policy masters every task. With noise
-    it is `metrics.MASTERED` of the episodes at the goal, NaN where the goal does not pay most.
+    Without noise of rewards it is a mean return: `metrics.MASTERED` times a positive optimal value, or that share of
+    the way from the worst mean return to another. With noise it is `metrics.MASTERED` of the episodes at the goal, NaN
+    where the goal does not pay most.
     """
     best = optimal_values(tasks)
     if isinstance(best, Undefined):
@@ -290,9 +289,9 @@ def mastery_thresholds(tasks: Sequence[TaskLike]) -> Tensor | Undefined:
 
 
 def evaluation_noise(task: TaskLike, evaluation: Evaluation) -> float:
-    """Return the standard deviation of the noise of rewards in a task's mean return, at most.
+    """Return the largest standard deviation of a task's mean return by the noise of rewards.
 
-    Where agents adapt, the mean is that of one place in each row. Exact means have none.
+    Where agents adapt, the mean is of one place in each row. Exact means have none.
     """
     if evaluation.exact or not isinstance(task, Task):
         return 0.0
@@ -309,14 +308,14 @@ def _have_noise(tasks: Sequence[TaskLike]) -> Tensor:
 
 
 def _mastery_curves(log: RunLog, curriculum: Curriculum, returns: Curves) -> Curves:
-    """Return the curves with the share of episodes at the goal for tasks whose rewards have noise."""
+    """Return the curves, with shares of episodes at the goal for tasks with noisy rewards."""
     have_noise = _have_noise(curriculum.tasks)
     shares = log.curves(curriculum.trained, "success_rate").performance
     return replace(returns, performance=torch.where(have_noise, shares, returns.performance))
 
 
 def _known(value: Callable[[Task, float], float], task: Task) -> float:
-    """An undiscounted value; NaN where the graph is too large to know it."""
+    """An undiscounted value; NaN where the graph is too large."""
     try:
         return value(task, 1.0)
     except ValueError:
@@ -324,7 +323,7 @@ def _known(value: Callable[[Task, float], float], task: Task) -> float:
 
 
 def _interval_best(log: RunLog, curriculum: Curriculum, best: Tensor | Undefined) -> Tensor | Undefined:
-    """Return the optimum of the block that each interval ends in; NaN where tasks of a block differ in it."""
+    """Return the optimum of each interval's last block; NaN where its tasks differ."""
     if isinstance(best, Undefined):
         return best
     alone = []
@@ -335,7 +334,7 @@ def _interval_best(log: RunLog, curriculum: Curriculum, best: Tensor | Undefined
 
 
 def _labelling(log: RunLog, curriculum: Curriculum) -> Labelling | Undefined:
-    """Return the labels that the learner gave to tasks itself; undefined where it gave none."""
+    """Return the labels that the learner gave to tasks, if any."""
     acted = log.training("acted_label")
     ends = log.training("frames")
     if not len(acted) or acted.isnan().any():
@@ -354,7 +353,7 @@ def _labelling(log: RunLog, curriculum: Curriculum) -> Labelling | Undefined:
 
 
 def _first_blocks(log: RunLog, curriculum: Curriculum) -> NamedValues:
-    """Return the intervals of each task in the block that trains it first, which must train no other."""
+    """Return each task's intervals in its first block, which must train no other."""
     blocks = curriculum.trained
     firsts: dict[int, int] = {}
     for number, block in enumerate(blocks):
@@ -384,7 +383,7 @@ def _first_blocks(log: RunLog, curriculum: Curriculum) -> NamedValues:
 def _regimes(
     log: RunLog, curriculum: Curriculum, best: Tensor | Undefined, experts: Sequence[RunLog] | None
 ) -> NamedValues:
-    """Return the run and its experts as the lifelong metrics see them."""
+    """Return the run and its experts as regimes."""
     lowest = lowest_returns(curriculum.tasks)
     for each in (best, lowest):
         if isinstance(each, Undefined):
@@ -410,7 +409,7 @@ def _regimes(
 def _areas(
     curves: Curves | Undefined, best: Tensor | Undefined, experts: Sequence[RunLog] | None, trapezoids: bool
 ) -> NamedValues:
-    """Return areas under curves for forward transfer; its definitions are of performance whose best is 1."""
+    """Return areas for forward transfer, whose definitions have 1 as the best performance."""
     kind = "trapezoid_areas" if trapezoids else "areas"
     try:
         require((experts is not None, NO_EXPERTS))
@@ -431,7 +430,7 @@ def _areas(
 
 
 def _check_stages(curves: Curves, least: int) -> None:
-    """Raise `Undefined` for a task whose own block, as definitions need it, has no area of so many evaluations."""
+    """Raise `Undefined` for a task whose own block has fewer evaluations."""
     for task in range(curves.performance.shape[1]):
         count = len(curves.own_stage(task))
         if count < least:

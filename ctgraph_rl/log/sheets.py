@@ -1,4 +1,4 @@
-"""Tables in no particular format, and what they are as text, Markdown and LaTeX."""
+"""Tables in no particular format, and as text, Markdown and LaTeX."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ MATHS = {
     "p": "$p$",
 }
 WIDE = 60
-"""Characters from which on a column of a LaTeX table is broken into lines."""
+"""Characters from which on LaTeX breaks a column into lines."""
 
 
 WIDTH = 100
-"""Characters of a line where no terminal says how many there are."""
+"""Characters of a line without a terminal."""
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """A table in no particular format.
+    """A table.
 
     Args:
         title: a line above it.
-        columns: the columns' names, each with ``l`` or ``r`` for its alignment.
-        rows: texts, one for each column.
+        columns: names, each with ``l`` or ``r`` for alignment.
+        rows: a text per column.
         notes: lines below it.
     """
 
@@ -50,7 +50,7 @@ class Sheet:
 
 
 def print_sheet(sheet: Sheet, console: Console | None = None) -> None:
-    """Print a table on the terminal; into a pipe `WIDTH` characters wide, or as wide as numbers and names need."""
+    """Print a table; into a pipe `WIDTH` characters wide, or as wide as numbers and names need."""
     console = Console() if console is None else console
     table = Table(title=_shown(sheet.title), title_justify="left", caption_justify="left")
     for i, (name, side) in enumerate(sheet.columns.items()):
@@ -79,7 +79,7 @@ def to_markdown(sheet: Sheet) -> str:
 
 
 def to_latex(sheet: Sheet) -> str:
-    """A table in LaTeX, for the package booktabs; title and notes as comments."""
+    """A table for the LaTeX package booktabs; title and notes as comments."""
     sides = []
     for i, side in enumerate(sheet.columns.values()):
         is_wide = any(len(row[i]) > WIDE for row in sheet.rows)
@@ -93,11 +93,11 @@ def to_latex(sheet: Sheet) -> str:
 
 
 FORMATS: dict[str, Callable[[Sheet], str]] = {"markdown": to_markdown, "latex": to_latex}
-"""What makes a text of a table, by the name of the format; ``text`` is the terminal's."""
+"""Makers of texts by format; ``text`` is the terminal's."""
 
 
 def with_numbers(sheet: Sheet) -> Sheet:
-    """Return a table whose last column, of long texts that repeat, has their numbers; notes below it have the texts."""
+    """Return a table whose last column, of long repeated texts, has numbers that notes below explain."""
     texts = list(dict.fromkeys(row[-1] for row in sheet.rows))
     rows = tuple((*row[:-1], str(texts.index(row[-1]) + 1)) for row in sheet.rows)
     return replace(sheet, rows=rows, notes=tuple(f"{number}: {text}" for number, text in enumerate(texts, 1)))

@@ -1,10 +1,10 @@
 """The source that a run's numbers depend on beside this package: a digest of each module of the user.
 
-A module is the user's if it is a .py file that is neither of this package, nor of the standard library, nor installed.
-It counts with all modules of the user that it imports, also within functions. A digest is one of the syntax: comments,
-docstrings and layout do not change it, and it is equal on Python 3.11 to 3.13. Of a script that is run, which is
-``__main__``, only the definitions count that a class needs. An installed package counts by its version, and only if a
-class of it is named; those that the user's modules import do not count, nor do files of data and compiled extensions.
+A module is the user's if it is a .py file neither of this package, nor of the standard library, nor installed. It
+counts with all modules of the user that it imports, also within functions. Digests are of the code: comments,
+docstrings and layout do not count. Of a script, ``__main__``, only the
+definitions count that a class needs. An installed package counts by its version, if a class of it is named. Data and
+compiled extensions do not count.
 """
 
 from __future__ import annotations
@@ -21,43 +21,39 @@ from pathlib import Path
 from typing import NamedTuple
 
 OURS = ("ctgraph_rl", "baselines", "curricula", "hydra_plugins")
-"""Packages whose changes the numbers version tells."""
+"""Packages that the numbers version covers."""
 
 RECORDED = ("torch", "torchrl", "tensordict", "hydra")
-"""Installed packages whose versions do not count here: every run stores those that decide its bits."""
+"""Installed packages whose versions every run stores anyway."""
 
 INSTALLED = frozenset({"site-packages", "dist-packages"})
-"""Folders of installed packages."""
 
 STANDARD = tuple(sysconfig.get_path(name) for name in ("stdlib", "platstdlib"))
-"""Folders of the standard library."""
 
 SCRIPT = "__main__"
 
 SCRIPTS = (SCRIPT, "__mp_main__")
-"""The script that runs, and its name in processes that ``multiprocessing`` starts."""
+"""The script, and its name in processes of ``multiprocessing``."""
 
 
 class Module(NamedTuple):
-    """A module of the user."""
+    """A user's module."""
 
     digest: str | None  # None if its file cannot be read
     imports: frozenset[str]  # modules that it imports, and names that may be modules
 
 
 _READ: dict[str, tuple[ModuleSpec, Module]] = {}
-"""Modules as they were when this process first read them after importing them: a later edit does not change the code
-that runs."""
+"""Modules as first read after their import: later edits do not change the running code."""
 
 
 def find_sources(names: Iterable[str]) -> dict[str, str | None]:
-    """Return the digest of each module of the user that some classes or functions need, by the module's name.
+    """Return the digest of each user module that classes or functions need, by module name.
 
-    An installed package that one of them is of has its version instead; None stands for what cannot be read, such as a
-    class of a notebook.
+    An installed package has its version instead; None stands for what cannot be read, such as a notebook's class.
 
     Args:
-        names: dotted names, such as ``my_agent.MyAgent``; those of this package and of Python itself need nothing.
+        names: dotted names, such as ``my_agent.MyAgent``; those of this package and Python need nothing.
     """
     found: dict[str, str | None] = {}
     waiting: list[str] = []
@@ -80,7 +76,7 @@ def find_sources(names: Iterable[str]) -> dict[str, str | None]:
 
 
 def _specs(name: str) -> Iterator[tuple[str, ModuleSpec]]:
-    """Yield the packages and the module at the beginning of a dotted name, as far as there are any; imports none."""
+    """Yield the packages and the module at the beginning of a dotted name, without importing."""
     package, *rest = name.split(".")
     if package in OURS:
         return
@@ -113,7 +109,7 @@ def _is_installed(spec: ModuleSpec) -> bool:
 
 
 def _installed(package: str) -> dict[str, str | None]:
-    """Return an installed package with its version, and None for what is nowhere; empty for any other."""
+    """Return an installed package's version, None for what is nowhere; else nothing."""
     spec = _top(package)
     if spec is None:
         return {package: None}
@@ -127,7 +123,7 @@ def _installed(package: str) -> dict[str, str | None]:
 
 
 def _module(name: str, spec: ModuleSpec) -> Module:
-    """Return a module; one that this process has imported as it was when it was first read since."""
+    """Return a module; an imported one as first read since."""
     imported = getattr(sys.modules.get(name), "__spec__", None)
     if imported is not None and name in _READ and _READ[name][0] is imported:
         return _READ[name][1]
@@ -146,7 +142,7 @@ def read_module(name: str, source: bytes, is_package: bool = False) -> Module:
 
     Args:
         name: its dotted name, which relative imports start from.
-        source: its file; one that is no Python of this version counts byte by byte.
+        source: its file; other than Python of this version it counts by bytes.
         is_package: whether it is the ``__init__`` of a package.
     """
     package = name if is_package else name.rpartition(".")[0]
@@ -159,7 +155,7 @@ def read_module(name: str, source: bytes, is_package: bool = False) -> Module:
 
 
 def _of_script(name: str) -> Module | None:
-    """Return what a class or function of the script that runs needs of it; None without a file that defines it."""
+    """Return what a class or function of the script needs of it; None without a defining file."""
     path = getattr(sys.modules.get(SCRIPT), "__file__", None)
     if path is None or not Path(path).is_file():
         return None
@@ -173,7 +169,7 @@ def _of_script(name: str) -> Module | None:
 
 
 def _needed(statements: Iterable[ast.stmt], name: str) -> list[ast.stmt]:
-    """Return the statements that define a name, and those that define what they mention, in order."""
+    """Return the statements that define a name or what they mention, in order."""
     mentions = {each: {node.id for node in ast.walk(each) if isinstance(node, ast.Name)} for each in statements}
     defines = {each: set(_defined(each)) for each in mentions}
     wanted = {name}
@@ -189,7 +185,7 @@ DEFINITIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
 
 
 def _defined(statement: ast.stmt) -> Iterator[str]:
-    """Yield the names that a statement of a module defines, or may define, and of what it sets an attribute or item."""
+    """Yield the names that a statement defines, or whose attribute or item it sets."""
     if isinstance(statement, DEFINITIONS):
         yield statement.name
         return
@@ -207,14 +203,14 @@ def _defined(statement: ast.stmt) -> Iterator[str]:
 
 
 def _root(node: ast.expr) -> ast.expr:
-    """Return what an attribute or item is of, at any depth."""
+    """Return the base of an attribute or item, at any depth."""
     while isinstance(node, (ast.Attribute, ast.Subscript)):
         node = node.value
     return node
 
 
 def _imports(tree: ast.AST, package: str) -> Iterator[str]:
-    """Yield the dotted names that statements import, and those of modules that ``import_module`` imports."""
+    """Yield the dotted names that statements or ``import_module`` import."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             for alias in node.names:
@@ -240,7 +236,7 @@ def code_text(tree: ast.AST) -> str:
 
 
 def _has_no_effect(node: ast.AST) -> bool:
-    """Return whether a statement does nothing, as docstrings do."""
+    """Return whether a statement, such as a docstring, does nothing."""
     return isinstance(node, ast.Pass) or (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant))
 
 

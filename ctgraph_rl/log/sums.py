@@ -1,7 +1,6 @@
-"""What a finished run wrote: ``sums.json`` holds length and SHA-256 of each file, so that a damaged run is noticed.
+"""Length and SHA-256 of each file of a finished run, in ``sums.json``, so that damage is noticed.
 
-It is written after all other results and right before ``metrics.json``, which it covers, too. Its ``run`` differs
-each time that results are written. `ctgraph_rl.log.damage` compares the files with it.
+It is written after all other results, right before ``metrics.json``, which it covers, too. ``run`` differs each time.
 """
 
 from __future__ import annotations
@@ -18,20 +17,17 @@ from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG, METRICS
 from ctgraph_rl.strict import json_value
 
 SUMS = "sums.json"
-"""The file with the sums."""
 
 MOST_BYTES_OF_SUMS = 2**16
-"""Largest `SUMS` that is read."""
 
 TABLES = ("evaluations.csv", "training.csv", "performance.csv")
 
 RESULTS = (LOG, CURRICULUM, AGENT, *TABLES, SUMS, METRICS)
-"""Files that a run writes into its directory, in this order; ``metrics.json`` is there when the run is complete,
-``curriculum.json`` where the curriculum has only parts of this package's classes."""
+"""Files of a run, in the order of writing; ``curriculum.json`` only for parts of this package's classes."""
 
 
 def write_sums(run_dir: Path, metrics: bytes) -> None:
-    """Write the sums of the results in a directory, and of the metrics that are about to be written."""
+    """Write the sums of a directory's results and of the metrics to come."""
     files = {}
     for name in RESULTS:
         if name not in (SUMS, METRICS) and (run_dir / name).exists():
@@ -41,9 +37,9 @@ def write_sums(run_dir: Path, metrics: bytes) -> None:
 
 
 def is_complete(run_dir: Path) -> bool:
-    """Return whether a run says that it is complete and its files have the lengths that were written.
+    """Return whether a run says that it is complete and its files have their lengths.
 
-    Without sums, files must not be empty. No file but the sums is read, as a sweep asks this of every cell.
+    Without sums, files must not be empty. Only the sums are read, as a sweep asks this of every cell.
     """
     sizes = {}
     for name in RESULTS:
@@ -56,7 +52,7 @@ def is_complete(run_dir: Path) -> bool:
 
 
 def stored_sums(run_dir: Path) -> Mapping[str, Mapping[str, Any]]:
-    """Return the stored sum of each file, none where they cannot be read."""
+    """Return the stored sums by file, none if unreadable."""
     try:
         files = json_value(read_regular(run_dir / SUMS, MOST_BYTES_OF_SUMS))["files"]
         ours = METRICS in files and all(name in RESULTS and isinstance(files[name], dict) for name in files)
@@ -66,5 +62,5 @@ def stored_sums(run_dir: Path) -> Mapping[str, Mapping[str, Any]]:
 
 
 def sum_of(content: bytes) -> dict[str, Any]:
-    """Return length and SHA-256 of the content of a file."""
+    """Return a content's length and SHA-256."""
     return {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}

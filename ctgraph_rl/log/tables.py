@@ -1,8 +1,7 @@
 """A run's log as tidy tables: one row per evaluation of a task, one row per training interval.
 
-CSV always, Parquet with ``pip install 'ctgraph_rl[tables]'``. The first columns say which run a row is of, so that the
-tables of many runs can be put below each other. Undefined and unmeasured values are empty cells, or null. A
-reader in three lines::
+CSV always, Parquet with ``pip install 'ctgraph_rl[tables]'``. The first columns name the run, so tables of many runs
+can be concatenated. Unmeasured values are empty or null. A reader in three lines::
 
     import csv
     with open("evaluations.csv", newline="", encoding="utf-8") as file:
@@ -50,7 +49,7 @@ EVALUATIONS = {
     **EPISODES,
     **SECONDS,
 }
-"""Columns of ``evaluations``: type and meaning."""
+"""Columns: type and meaning."""
 
 TRAINING = {
     **RUN,
@@ -59,24 +58,21 @@ TRAINING = {
     **EPISODES,
     **SECONDS,
 }
-"""Columns of ``training``: type and meaning; what the agent reports follows, each a double."""
+"""Columns: type and meaning; the agent's reports follow as doubles."""
 
 MOST_COLUMNS = 256
-"""Of a table: every line of a log might name others."""
+"""Of a table: each line of a log may name others."""
 
 TABLES = {"evaluation": ("evaluations", EVALUATIONS), "training": ("training", TRAINING)}
 
 
 def write_tables(log: RunLog, folder: Path | str, parquet: bool | None = None) -> list[Path]:
-    """Write ``evaluations`` and ``training`` into a folder.
+    """Write ``evaluations`` and ``training`` into a folder; return the files.
 
     Args:
         log: the run's log.
         folder: where they go.
-        parquet: write Parquet, too; None writes it where pyarrow is installed.
-
-    Returns:
-        The files.
+        parquet: write Parquet, too; None: if pyarrow is installed.
 
     Raises:
         ModuleNotFoundError: with ``parquet=True`` and without pyarrow; names the extra to install.
@@ -98,7 +94,7 @@ def write_tables(log: RunLog, folder: Path | str, parquet: bool | None = None) -
 
 
 def check_table(path: Path) -> None:
-    """Refuse a file of evaluations that `write_evaluations` cannot write.
+    """Refuse a file that `write_evaluations` cannot write.
 
     Raises:
         ValueError: for another ending than ``.csv`` and ``.parquet``.
@@ -110,11 +106,11 @@ def check_table(path: Path) -> None:
 
 
 def write_evaluations(path: Path, runs: Sequence[tuple[str, str, RunLog]]) -> None:
-    """Write the evaluations of many runs as one table, in CSV or Parquet by the ending of its name.
+    """Write the evaluations of many runs as one table, CSV or Parquet by its ending.
 
     Args:
-        path: see `check_table`.
-        runs: agent, directory and log of each; agent and directory are the first two columns.
+        path: as `check_table` allows.
+        runs: agent, directory (the first two columns) and log of each.
     """
     check_table(path)
     types = _types("evaluation", EVALUATIONS, *(log for _, _, log in runs))
@@ -127,7 +123,7 @@ def write_evaluations(path: Path, runs: Sequence[tuple[str, str, RunLog]]) -> No
 
 
 def require_parquet() -> None:
-    """Refuse work that needs pyarrow where it is not installed.
+    """Refuse work without pyarrow.
 
     Raises:
         ModuleNotFoundError: names the extra to install.
@@ -139,7 +135,7 @@ def require_parquet() -> None:
 
 
 def _types(kind: str, columns: dict[str, tuple[str, str]], *logs: RunLog) -> dict[str, str]:
-    """Type of each column; what else the logs have follows as numbers, in the order of first appearance."""
+    """Type of each column; the logs' other fields follow as numbers, by first appearance."""
     types = {name: type_ for name, (type_, _) in columns.items()}
     for log in logs:
         names = dict.fromkeys(chain(*log.of_kind(kind)))

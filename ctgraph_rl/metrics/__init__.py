@@ -1,8 +1,7 @@
 """Lifelong-learning metrics: pure functions of a run's performance matrix, evaluation curves and training curves.
 
-A metric is a function with ``@defined`` in any module of this folder: it is an attribute here, computed wherever the
-inputs that its arguments name are there, and gives its value with its meaning or the reason why it has none, where
-nothing is imputed. The modules import only each other; logs, recorders and reports use them.
+A metric is a function with ``@defined`` in a module of this folder. It is computed wherever a run has the inputs that
+its arguments name, and gives a value with its meaning or the reason why there is none; nothing is imputed.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ SUMMARY = (average_performance, forward_transfer, backward_transfer, forgetting)
 """The metrics that every run shows."""
 
 ORDER = ("matrix", "curves", "optimum", "ceilings", "lifetime", "transfer")
-"""Modules in the order in which their metrics are listed; those of others follow."""
+"""Modules as listed; other modules follow."""
 
 for _found in iter_modules(__path__):
     import_module(f"{__name__}.{_found.name}")
@@ -36,11 +35,11 @@ NamedMetrics = dict[str, Metric]
 
 
 def of_inputs(given: Mapping[str, Any]) -> NamedMetrics:
-    """Compute every metric whose inputs are given, by name.
+    """Compute every metric whose inputs are given.
 
     Args:
-        given: inputs by the names that `ctgraph_rl.metrics.inputs.INPUTS` has; an `Undefined` in place of one that
-            there is not, with the reason.
+        given: inputs by the names of `ctgraph_rl.metrics.inputs.INPUTS`; an `Undefined` gives the reason for a missing
+            one.
     """
 
     def place(entry: Entry) -> int:
@@ -52,46 +51,46 @@ def of_inputs(given: Mapping[str, Any]) -> NamedMetrics:
 
 
 def summary(performance: Tensor, trained: Trained) -> NamedMetrics:
-    """Compute the metrics that every run shows; what a definition does not cover is undefined with the reason.
+    """Compute the metrics that every run shows, undefined with the reason where a definition does not apply.
 
     Args:
         performance: float64 [blocks + 1, tasks].
         trained: for each block, the tasks that it trained, counted from 0.
 
     Returns:
-        Metrics by name in the order average performance, forward transfer, backward transfer, forgetting.
+        Average performance, forward transfer, backward transfer, forgetting.
     """
     return {metric.__name__: metric(performance, trained) for metric in SUMMARY}
 
 
 def of_matrix(performance: Tensor, trained: Trained) -> NamedMetrics:
-    """Compute all metrics that need only the performance matrix, those of `summary` first; arguments as there."""
+    """Compute all metrics that need only the performance matrix; arguments as `summary`."""
     return of_inputs({"performance": performance, "trained": trained})
 
 
 def of_curves(curves: Curves) -> NamedMetrics:
-    """Compute all metrics of evaluation curves that need no expert; of returns without noise."""
+    """Compute all metrics of evaluation curves of returns without noise that need no expert."""
     return of_inputs({"curves": curves, "mastery_curves": curves})
 
 
 def of_regimes(regimes: Sequence[Regime], experts: Mapping[str, Sequence[Tensor]] | None = None) -> NamedMetrics:
-    """Compute the lifelong metrics of regimes; `prepare` them first to get the numbers of l2metrics' defaults.
+    """Compute the lifelong metrics of regimes; `prepare` them first for the numbers of l2metrics' defaults.
 
     Args:
         regimes: a run.
-        experts: for each task, the training curves of its experts.
+        experts: for each task, its experts' training curves.
     """
     return of_inputs({"regimes": regimes, "experts": experts or {}})
 
 
 def definitions() -> dict[str, Definition]:
-    """Return every definition by the name of its function, in the order of the ids."""
+    """Return every definition by its function's name, ordered by id."""
     found = {name: entry.meaning for name, entry in METRICS.items()}
     return dict(sorted(found.items(), key=lambda item: item[1].id))
 
 
 AGAINST_EXPERTS = tuple(entry.metric for entry in METRICS.values() if "experts" in entry.required)
-"""Lifelong metrics that compare training with experts'."""
+"""Lifelong metrics relative to experts."""
 
 
 def __getattr__(name: str) -> Callable[..., Metric]:

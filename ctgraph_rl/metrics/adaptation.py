@@ -1,8 +1,7 @@
 """Metrics of adaptation within a row of an evaluation, against the best search for one of n uniform goals.
 
-A searcher that knows how to get to each of n end states, and nothing of the goal, tries each once and returns to the
-goal. It succeeds in its i-th episode with probability min(1, i/n), and first in episode (n + 1)/2 on average. No
-one does better over goals that are drawn uniformly.
+The best searcher knows the way to each of n end states, tries each once and returns to the goal. It succeeds in its
+i-th episode with probability min(1, i/n), and first in episode (n + 1)/2 on average.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from ctgraph_rl.metrics.record import HERE, defined
 
 
 class Adaptation(NamedTuple):
-    """The last evaluation with adaptation; a row for each task, a column for each episode of a row."""
+    """The last evaluation with adaptation; [tasks, episodes of a row]."""
 
     returns: Tensor  # float64 [tasks, episodes]: mean return
     success: Tensor  # float64 [tasks, episodes]: share of rows that reached the goal
@@ -26,11 +25,7 @@ class Adaptation(NamedTuple):
 
 
 def exact_search(num_goals: int, num_episodes: int) -> Tensor:
-    """Return the success rate of the best search in each of its episodes, min(1, i/n), float64 [num_episodes].
-
-    Args:
-        num_goals: n.
-        num_episodes: episodes one after the other.
+    """Return the best search's success rate in each episode, min(1, i/n), float64 [num_episodes].
 
     Example:
         >>> exact_search(4, 5).tolist()
@@ -42,7 +37,7 @@ def exact_search(num_goals: int, num_episodes: int) -> Tensor:
 
 @defined("ctgraph_rl/adapted-return", "1/T sum_j return_j in the last episode of rows", HERE, bounds=of_performance)
 def adapted_return(adaptation: Adaptation) -> Tensor:
-    """Return the mean return on trained tasks in the last episode of a row, after all others."""
+    """Return the mean return on trained tasks in a row's last episode."""
     return adaptation.returns[:, -1]
 
 
@@ -65,9 +60,9 @@ def held_out_adapted_return(adaptation: Adaptation) -> Tensor:
     bounds=of_search_regret,
 )
 def search_regret(adaptation: Adaptation) -> Tensor:
-    """Return the goals that a row misses beside the best search: the area between its curve and the exact one.
+    """Return the goals that a row misses against the best search: the area between their curves.
 
-    0 is optimal. Below 0 is chance, or a task whose goals are not uniform.
+    0 is optimal; below 0 is by chance, or goals are not uniform.
     """
     return _regret(adaptation)
 
@@ -93,9 +88,9 @@ def held_out_search_regret(adaptation: Adaptation) -> Tensor:
     is_time=True,
 )
 def first_success(adaptation: Adaptation) -> Tensor:
-    """Return the first success of rows over that of the best search, (n + 1)/2 episodes: 1 is optimal.
+    """Return rows' first success over the best search's, (n + 1)/2 episodes: 1 is optimal.
 
-    Undefined for a task with a row that never reached the goal.
+    Undefined if a row never reached the goal.
     """
     return _first(adaptation)
 

@@ -1,4 +1,4 @@
-"""The lowest and the highest value that metrics can have, from what is known of a run before it starts."""
+"""Lowest and highest values of metrics, known before a run starts."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 NOISE = 4
-"""Standard deviations that the noise of a mean return may reach."""
+"""Standard deviations by which a mean return may be off."""
 
 
 class Known(NamedTuple):
-    """Bounds on the numbers of a run: of what is measured, so neither the optimum nor a mean over episodes is one."""
+    """Bounds on what a run measures, without the optimum, which is no mean over episodes."""
 
     low: float  # lowest return of an evaluation of any task, with the noise of rewards; -inf where nothing bounds it
     high: float  # highest one
@@ -25,36 +25,36 @@ class Known(NamedTuple):
 
 LowAndHigh = tuple[float, float]
 BoundsOf = Callable[[Known], LowAndHigh]
-"""What a metric says of its values: their bounds, infinite where there are none."""
+"""A metric's bounds; infinite if there are none."""
 
 
 def unbounded(known: Known) -> LowAndHigh:
-    """Return the bounds of anything."""
+    """Return infinite bounds."""
     return -math.inf, math.inf
 
 
 def not_negative(known: Known) -> LowAndHigh:
-    """Return the bounds of ratios and of what is lost against the best."""
+    """Return the bounds of ratios and losses against the best."""
     return 0.0, math.inf
 
 
 def at_most_1(known: Known) -> LowAndHigh:
-    """Return the bounds of a share of what there was to gain up to the optimum."""
+    """Return the bounds of a share of the possible gain."""
     return -math.inf, 1.0 if known.highest_share <= 1 else math.inf
 
 
 def of_regret(known: Known) -> LowAndHigh:
-    """Return the bounds of what is lost against the optimum; chance may gain something, where an episode can."""
+    """Return the bounds of losses against the optimum; chance may gain, where an episode can."""
     return 0.0 if known.highest_share <= 1 else -math.inf, math.inf
 
 
 def of_search_regret(known: Known) -> LowAndHigh:
-    """Return the bounds of the goals that a row misses beside the best search."""
+    """Return the bounds of goals missed against the best search."""
     return known.lowest_search_regret, known.highest_search_regret
 
 
 def between(low: float, high: float) -> BoundsOf:
-    """Return what says the same bounds of every run."""
+    """Return the same bounds for every run."""
     return lambda known: (low, high)
 
 
@@ -69,13 +69,13 @@ def of_changes(known: Known) -> LowAndHigh:
 
 
 def of_changes_but_one(known: Known) -> LowAndHigh:
-    """Return the bounds of means over tasks of such differences, of which that of one task is 0."""
+    """Return the bounds of means over tasks of differences, one of which is 0."""
     share = (known.tasks - 1) / known.tasks
     return share * (known.low - known.high) if share else 0.0, share * (known.high - known.low) if share else 0.0
 
 
 def of_gains(known: Known) -> LowAndHigh:
-    """Return the bounds of the part of a change that is not negative."""
+    """Return the bounds of a change's positive part."""
     return 0.0, known.high - known.low
 
 
@@ -85,13 +85,13 @@ def of_remembering(known: Known) -> LowAndHigh:
 
 
 def of_scaled_changes(known: Known) -> LowAndHigh:
-    """Return the bounds of changes that are divided by the largest size of a performance."""
+    """Return the bounds of changes over the largest size of a performance."""
     largest = 1.0 if known.low >= 0 or known.high <= 0 else 2.0
     return -largest, largest
 
 
 def of_lost_shares(known: Known) -> LowAndHigh:
-    """Return the bounds of the share of the best performance that is lost."""
+    """Return the bounds of the lost share of the best performance."""
     return 0.0, 1.0 if known.low >= 0 else math.inf
 
 
@@ -112,13 +112,13 @@ def of_counts(known: Known) -> LowAndHigh:
 
 
 def from_failure_to_best(low: float, high: float) -> BoundsOf:
-    """Return the bounds of performance on a scale on which a failure is ``low`` and the optimum ``high``."""
+    """Return the bounds of performance where a failure is ``low`` and the optimum ``high``."""
     scale = high - low
     return lambda known: (low + scale * known.lowest_share, low + scale * known.highest_share)
 
 
 def of_changes_on_scale(scale: float) -> BoundsOf:
-    """Return the bounds of differences of performance on such a scale, ``scale`` long from a failure to the optimum."""
+    """Return the bounds of differences on a scale of length ``scale`` from failure to optimum."""
 
     def bounds(known: Known) -> LowAndHigh:
         widest = scale * (known.highest_share - known.lowest_share)

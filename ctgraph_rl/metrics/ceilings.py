@@ -1,7 +1,7 @@
 """Metrics of what tasks allow: three ceilings on the mean return, the gap that memory closes, and what is observed.
 
-The ceilings and the entropies are facts of the curriculum, the same for every run of it. They stand beside the numbers
-that a run reached, or say why they are not known. Noise and rotation on read are left out of what is observed.
+Ceilings and entropies are equal for every run of a curriculum, and say why they are not known where they are not. Noise
+and rotation on read are left out of what is observed.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def open_loop_ceiling(open_loop_ceilings: Tensor) -> Tensor:
     """Mean over tasks of the best mean return of a fixed sequence of actions, which ignores all observations.
 
     Args:
-        open_loop_ceilings: each task's `ctgraph_rl.tasks.values.open_loop_ceiling`, float64 [tasks].
+        open_loop_ceilings: by `ctgraph_rl.tasks.values.open_loop_ceiling`, float64 [tasks].
     """
     return open_loop_ceilings
 
@@ -31,7 +31,7 @@ def memoryless_ceiling(memoryless_ceilings: Tensor) -> Tensor:
     """Mean over tasks of the best mean return of a policy that sees an observation and remembers nothing.
 
     Args:
-        memoryless_ceilings: each task's `ctgraph_rl.tasks.values.memoryless_ceiling`, of any policy, float64 [tasks].
+        memoryless_ceilings: by `ctgraph_rl.tasks.values.memoryless_ceiling`, of any policy, float64 [tasks].
     """
     return memoryless_ceilings
 
@@ -44,7 +44,7 @@ def memoryless_ceiling(memoryless_ceilings: Tensor) -> Tensor:
     is_exact=True,
 )
 def optimal_performance(best: Tensor) -> Tensor:
-    """Mean over tasks of the best mean return of any policy, of one that knows the goal where goals change.
+    """Mean over tasks of the best mean return of any policy, which knows goals that change.
 
     Args:
         best: each task's `Task.optimal_value(1.0)`.
@@ -63,8 +63,7 @@ def optimal_performance(best: Tensor) -> Tensor:
 def memory_gap_closed(performance: Tensor, memoryless_ceilings: Tensor, best: Tensor) -> Tensor:
     """Share of the gap between the best memoryless policy and the optimum that is closed after the last block.
 
-    1 is optimal, 0 is what the best policy without memory gets in the mean, and less than that is negative. Tasks that
-    a policy without memory solves are left out.
+    1 is optimal, 0 is the best policy without memory, and less is negative. Tasks that need no memory are left out.
 
     Args:
         performance: float64 [blocks + 1, tasks], mean undiscounted returns.
@@ -82,7 +81,7 @@ def state_entropy_random(random_entropies: Tensor) -> Tensor:
     """Mean over tasks of H(state | observation) in bits under the uniformly random policy; 0 is fully observable.
 
     Args:
-        random_entropies: each task's `ctgraph_rl.tasks.observability.state_entropy`, float64 [tasks].
+        random_entropies: by `ctgraph_rl.tasks.observability.state_entropy`, float64 [tasks].
     """
     return random_entropies
 

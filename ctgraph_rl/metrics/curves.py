@@ -1,4 +1,4 @@
-"""Metrics of evaluation curves: performance on every task, again and again while the curriculum is learned."""
+"""Metrics of evaluation curves: performance on every task while the curriculum is learned."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ class Curves:
 
     Args:
         performance: float64 [evaluations, tasks]; NaN where not evaluated.
-        blocks: for each evaluation, the block in or after which it was made; 0 before any training.
-        frames: for each evaluation, the frames learned so far.
-        trained: for each block, the tasks that it trained, counted from 0.
+        blocks: each evaluation's block; 0 before any training.
+        frames: frames learned by each evaluation.
+        trained: each block's tasks, counted from 0.
 
     Raises:
-        ValueError: if these do not fit each other.
+        ValueError: if these do not fit.
     """
 
     performance: Tensor
@@ -60,11 +60,11 @@ class Curves:
             raise ValueError(f"blocks must rise from 0 to at most {len(self.trained)}, got {self.blocks}")
 
     def of_block(self, block: int) -> list[int]:
-        """Positions of the evaluations in and after a block."""
+        """Positions of the evaluations of a block."""
         return list(range(bisect_left(self.blocks, block), bisect_right(self.blocks, block)))
 
     def check_whole(self) -> None:
-        """Leave the metric undefined where there is no evaluation in the last block."""
+        """Raise `Undefined` without an evaluation in the last block."""
         if self.blocks[-1] < len(self.trained):
             raise Undefined(f"the last evaluation is in block {self.blocks[-1]} of {len(self.trained)}")
 
@@ -76,14 +76,14 @@ class Curves:
         return torch.stack([self.performance[row[-1]] if row else nothing for row in rows])
 
     def smoothed(self, window: int) -> Curves:
-        """Every evaluation replaced by the mean of the last ``window`` ones, fewer at the start."""
+        """The means of the last ``window`` evaluations, fewer at the start."""
         if window < 1:
             raise ValueError(f"window must be >= 1, got {window}")
         means = [self.performance[max(0, i + 1 - window) : i + 1].mean(0) for i in range(len(self.performance))]
         return replace(self, performance=torch.stack(means))
 
     def own_block(self, task: int) -> int:
-        """The one block that trains a task, counted from 1."""
+        """The one block, from 1, that trains a task."""
         own = self._own_blocks.get(task, [])
         if len(own) != 1:
             raise Undefined(f"the definition needs each task trained once, task {task + 1} is in {len(own)} blocks")
@@ -100,7 +100,7 @@ class Curves:
         return found
 
     def own_stage(self, task: int) -> Tensor:
-        """The curve of a task while it was trained: evaluations in and after its block, at equal distances."""
+        """A task's evaluations in and after its block, at equal distances."""
         rows = self.of_block(self.own_block(task))
         steps = {after - before for before, after in pairwise(self.frames[i] for i in rows)}
         if not rows or len(steps) > 1:
@@ -122,8 +122,7 @@ def continual_world_performance(curves: Curves, last: int = 1) -> Tensor:
     """P: mean performance on all tasks at the end.
 
     Args:
-        curves: the evaluations of a run.
-        last: evaluations that "at the end" is the mean of: 1 as in the paper, 5 as in its code.
+        last: evaluations to average "at the end": 1 as in the paper, 5 as in its code.
     """
     return _final(curves, last)
 
@@ -141,8 +140,7 @@ def continual_world_forgetting(curves: Curves, last: int = 1) -> Tensor:
     Undefined unless each task is trained once, in a block without others.
 
     Args:
-        curves: the evaluations of a run.
-        last: evaluations that "at the end" is the mean of: 1 as in the paper, 5 as in its code.
+        last: as in `continual_world_performance`.
     """
     tasks = range(curves.performance.shape[1])
     own = torch.stack([curves.at_end_of(curves.own_block(task), task, last) for task in tasks])
@@ -150,14 +148,13 @@ def continual_world_forgetting(curves: Curves, last: int = 1) -> Tensor:
 
 
 def _final(curves: Curves, last: int) -> Tensor:
-    """Return the performance on each task at the very end, [tasks]."""
     tasks = range(curves.performance.shape[1])
     return torch.stack([curves.at_end_of(len(curves.trained), task, last) for task in tasks])
 
 
 @defined("ben-iwhiwhu2022/icr", "sum_j p_j(end)", LABS, aggregate=lambda returns: returns[-1], bounds=of_sums)
 def instant_cumulative_return(curves: Curves) -> Tensor:
-    """ICR(t) = sum_j p_j(t): the return over all tasks at evaluation t; the value is the last, the terms are all."""
+    """ICR(t) = sum_j p_j(t): the return over all tasks at evaluation t; the value is the last."""
     curves.check_whole()
     return curves.performance.sum(1)
 
@@ -166,7 +163,7 @@ def instant_cumulative_return(curves: Curves) -> Tensor:
 def total_performance_over_time(curves: Curves) -> Tensor:
     """TPOT = sum_{t>0} ICR(t) over all evaluations but those before training, which the published protocol lacks.
 
-    It grows with the number of evaluations, so compare equal protocols only.
+    It grows with the evaluations: compare equal protocols only.
     """
     curves.check_whole()
     return curves.performance[[block > 0 for block in curves.blocks]].sum(1)
@@ -182,15 +179,13 @@ def total_performance_over_time(curves: Curves) -> Tensor:
     bounds=of_lost_shares,
 )
 def relative_forgetting(curves: Curves, noise: Tensor | float = 0.0) -> Tensor:
-    """The share of the best performance ever on a task that is gone at the end, over all tasks.
+    """The lost share of each task's best performance ever, over all tasks.
 
-    The best is that of the evaluations that there are, as tasks may be evaluated only from their first block on; the
-    last one must be there. A task that never got above 0 has no value and is left out and counted; nor has one whose
-    best may be the noise of its rewards. In [0, 1] for performance that is.
+    The best is over the evaluations that there are; the last one must be there. Tasks whose best is not above 0, or
+    within the noise of rewards, are left out and counted. In [0, 1] for such performance.
 
     Args:
-        curves: the evaluations of a run.
-        noise: the standard deviation of the noise in an evaluation's return: a number, or one per task.
+        noise: standard deviation of an evaluation's return by noise: a number, or one per task.
     """
     curves.check_whole()
     if curves.performance[-1].isnan().any():
@@ -212,14 +207,13 @@ def relative_forgetting(curves: Curves, noise: Tensor | float = 0.0) -> Tensor:
 def tasks_learned(curves: Curves, threshold: Tensor | float = MASTERED) -> Tensor:
     """Number of tasks that are mastered right after the last block that trains them, forgotten later or not.
 
-    Ben-Iwhiwhu et al. report such a number without a formula; a later evaluation code of the labs (AMSC, 2026) counts
-    tasks that are at 0.9 at the very end. A task that no block trains is none.
+    Ben-Iwhiwhu et al. report such a number without a formula; a later code of the labs (AMSC, 2026) counts tasks at 0.9
+    at the very end.
 
     Args:
-        curves: the evaluations of a run. For a task whose rewards have noise, a run gives shares of episodes at the
-            goal, as noise takes a return beyond any threshold by chance.
+        curves: for tasks with noisy rewards a run gives shares of episodes at the goal.
         threshold: what counts as mastered: a number, or one per task. A run takes 0.9 of such a share, else 0.9 times
-            the optimal value, and where that is not positive 0.9 of the way from the worst possible mean return to it.
+            the optimal value; if that is not positive, 0.9 of the way to it from the worst mean return.
     """
     ends = curves.ends
     last = {task: block for block, tasks in enumerate(curves.trained, 1) for task in tasks}
@@ -242,8 +236,8 @@ def tasks_learned(curves: Curves, threshold: Tensor | float = MASTERED) -> Tenso
 def frames_to_mastery(curves: Curves, threshold: Tensor | float = MASTERED) -> Tensor:
     """Frames of a task's first block until the first evaluation that finds the task mastered.
 
-    Tasks that are only trained together with others are left out. Undefined if a task was not mastered in its block.
-    The distance between two evaluations is the resolution.
+    Tasks that are only trained with others are left out. Undefined if a task was not mastered in its block. Evaluations
+    are the resolution.
 
     Args:
         curves: as in `tasks_learned`.
@@ -273,9 +267,9 @@ def frames_to_mastery(curves: Curves, threshold: Tensor | float = MASTERED) -> T
 def regain(curves: Curves, threshold: Tensor | float = MASTERED) -> Tensor:
     """Frames until a task that returns is mastered again, as a share of the frames that it took the first time.
 
-    0: it was kept, as the last evaluation before the return finds it mastered. 1: it takes as long as at first. The
-    source's savings of relearning are 1 less this. A task returns where a block trains only it, after other tasks.
-    Tasks that were not mastered in their first block are left out; undefined if a task was not mastered again.
+    0: the last evaluation before the return finds it mastered. 1: it takes as long as at first. The source's savings of
+    relearning are 1 less this. A task returns where a block trains only it, after other tasks. Tasks that were not
+    mastered in their first block are left out; undefined if one was not mastered again.
 
     Args:
         curves: as in `tasks_learned`.
@@ -298,10 +292,10 @@ def regain(curves: Curves, threshold: Tensor | float = MASTERED) -> Tensor:
 
 
 def find_returns(trained: Sequence[Sequence[int]]) -> list[tuple[int, int, int]]:
-    """Return each return of a task: the task, its first block, and a later one after other tasks; each trains only it.
+    """Return the task, first block and later block of each return, after other tasks; the blocks train only it.
 
     Args:
-        trained: for each block, its tasks; blocks are counted from 1.
+        trained: each block's tasks; blocks count from 1.
     """
     first: dict[int, int] = {}
     shared = set()
@@ -320,7 +314,7 @@ def find_returns(trained: Sequence[Sequence[int]]) -> list[tuple[int, int, int]]
 
 
 def _frames_to(needed: Tensor, curves: Curves, block: int, task: int) -> float:
-    """Frames of a block until a task's first evaluation that is at least as needed; NaN where there is none."""
+    """Frames of a block until a task's first evaluation as good as needed, or NaN."""
     rows = curves.of_block(block)
     before = curves.of_block(block - 1)
     if block > 1 and not before:

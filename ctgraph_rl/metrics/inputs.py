@@ -1,4 +1,4 @@
-"""The inputs of metrics that a run gives. The names of a metric's arguments say which of them it takes."""
+"""The inputs of metrics that a run gives, by the names of arguments."""
 
 INPUTS = {
     "performance": "the performance matrix, float64 [blocks + 1, tasks]",
@@ -34,4 +34,4 @@ INPUTS = {
     "trapezoid_areas": "as ``areas``, by trapezoids",
     "expert_trapezoid_areas": "as ``expert_areas``, by trapezoids",
 }
-"""Every input by its name. `ctgraph_rl.log.scores` gives them, or the reason why a run has none."""
+"""By name; `ctgraph_rl.log.scores` gives them, or the reason why a run has none."""

@@ -1,8 +1,7 @@
 """Metrics of labels that a learner gives to tasks itself, against the true tasks.
 
-Training is given as intervals in time order, each of one batch, or of the part of it that is of one block. An *alarm*
-is where the learner leaves the label that it learns with, because a detector suspects a change of task or says another
-label. A *change* is where the task of the intervals changes.
+Training is intervals in time order, each of one batch, or a block's part of it. An *alarm* is where the learner leaves
+its label, because a detector suspects a change or says another label. A *change* is where the intervals' task changes.
 """
 
 from __future__ import annotations
@@ -21,14 +20,14 @@ from ctgraph_rl.metrics.record import HERE, Undefined, defined, float64
 HUBERT = "Hubert & Arabie 1985, Comparing partitions (Journal of Classification 2)"
 
 SEVERAL = -1
-"""In place of the task of an interval that has several."""
+"""The task of an interval that has several."""
 
 PER = 100_000
-"""Frames that alarms are counted per."""
+"""Frames per which alarms are counted."""
 
 
 class Labelling(NamedTuple):
-    """The labels of a run; a value for each of its training intervals, [intervals]."""
+    """The labels of a run; a value per training interval, [intervals]."""
 
     acted: Tensor  # int64: the label that acted
     task: Tensor  # int64: the true task, or SEVERAL
@@ -40,12 +39,12 @@ class Labelling(NamedTuple):
     oracle: bool = False  # whether the detector knows the true tasks
 
     def check_one_task_each(self) -> None:
-        """Leave the metric undefined where an interval has several tasks."""
+        """Raise `Undefined` where an interval has several tasks."""
         if (self.task == SEVERAL).any():
             raise Undefined("needs blocks of one task each: others have no true label")
 
     def check_hidden(self) -> None:
-        """Leave the metric undefined where changes are announced."""
+        """Raise `Undefined` where changes are announced."""
         if self.announced:
             raise Undefined("task changes are announced, there is nothing to detect")
 
@@ -60,11 +59,11 @@ class Labelling(NamedTuple):
     is_time=True,
 )
 def detection_delay(labelling: Labelling) -> Tensor:
-    """Return the frames from each change of task to the first alarm that can be due to it; NaN for a missed one.
+    """Return the frames from each change of task to its first alarm; NaN for a missed one.
 
-    Changes that were missed are left out of the mean, and counted. Alarms are at ends of batches. Those count whose
-    batch has frames of the new task, up to the batch that ends at the next change. An alarm right at the change has
-    seen only frames of the old task: it counts, with delay 0, for the oracle, which knows the task of the next batch.
+    Missed changes are left out of the mean, and counted. Alarms are at ends of batches; those count whose batch has
+    frames of the new task, up to the next change. An alarm right at the change has only seen the old task: it counts,
+    with delay 0, for the oracle.
     """
     return _delays(labelling)
 
@@ -84,7 +83,7 @@ def false_alarms(labelling: Labelling) -> Tensor:
 
 @defined("ctgraph_rl/labels-per-task", "labels learned with / tasks trained", HERE, bounds=not_negative)
 def labels_per_task(labelling: Labelling) -> Tensor:
-    """Return the number of different labels that were learned with, over the number of tasks; 1 is right."""
+    """Return the number of labels that were learned with, over that of tasks; 1 is right."""
     labelling.check_one_task_each()
     labels = labelling.acted[labelling.learned].unique()
     tasks = labelling.task.unique()
@@ -101,7 +100,7 @@ def labels_per_task(labelling: Labelling) -> Tensor:
 def label_agreement(labelling: Labelling) -> Tensor:
     """Return the adjusted Rand index of the true tasks and the labels that acted, over all frames of training.
 
-    1: each task has its own label, whatever its number. 0 is expected of labels without relation to the tasks.
+    1: each task has its own label. 0 is expected of unrelated labels.
     """
     labelling.check_one_task_each()
     return float64([adjusted_rand_index(*labelling[:3])])
@@ -109,13 +108,13 @@ def label_agreement(labelling: Labelling) -> Tensor:
 
 @defined("ctgraph_rl/frames-not-learned", "frames of batches that were not learned from", HERE, bounds=not_negative)
 def frames_not_learned(labelling: Labelling) -> Tensor:
-    """Return the number of frames that were not learned from, as labels were tried meanwhile."""
+    """Return the number of frames that were not learned from, while labels were tried."""
     return labelling.frames[~labelling.learned].sum().double().view(1)
 
 
 @defined("ctgraph_rl/frames-rolled-back", "frames whose learning was undone", HERE, bounds=not_negative)
 def frames_rolled_back(labelling: Labelling) -> Tensor:
-    """Return the number of frames whose learning an alarm undid: it restored what was learned before."""
+    """Return the number of frames whose learning an alarm undid."""
     return labelling.rolled_back.sum().double().view(1)
 
 
@@ -126,7 +125,7 @@ def frames_rolled_back(labelling: Labelling) -> Tensor:
     bounds=of_performance,
 )
 def online_return(episodes: Tensor, returns: Tensor) -> Tensor:
-    """Return the mean return of all episodes that finished in training: what was earned while learning.
+    """Return the mean return of all episodes that finished in training.
 
     Args:
         episodes: finished episodes of each interval, [intervals].
@@ -139,9 +138,8 @@ def online_return(episodes: Tensor, returns: Tensor) -> Tensor:
 
 
 def adjusted_rand_index(labels: Tensor, tasks: Tensor, frames: Tensor) -> float:
-    """Return the adjusted Rand index of two partitions of frames, given as intervals, [intervals] each.
-
-    Computed from exact integers, as numbers of pairs of frames do not fit in floats.
+    """Return the adjusted Rand index of two partitions of frames, given as intervals, [intervals] each; exact integers
+    inside.
     """
     table = counts(tasks, labels, frames)
     rows: Counter[int] = Counter()
@@ -162,7 +160,7 @@ def adjusted_rand_index(labels: Tensor, tasks: Tensor, frames: Tensor) -> float:
 
 
 def counts(tasks: Tensor, labels: Tensor, frames: Tensor) -> Counter[tuple[int, int]]:
-    """Return the number of frames of each task and label that occur together."""
+    """Return the frames of each task with each label."""
     found: Counter[tuple[int, int]] = Counter()
     for task, label, number in zip(tasks.tolist(), labels.tolist(), frames.tolist(), strict=True):
         found[task, label] += number
@@ -170,7 +168,7 @@ def counts(tasks: Tensor, labels: Tensor, frames: Tensor) -> Counter[tuple[int, 
 
 
 def most_frequent(tasks: Sequence[int], labels: Sequence[int], frames: Sequence[float]) -> dict[int, int]:
-    """Return the label with most frames of each task; of equal ones the lowest."""
+    """Return each task's label with most frames; of equal ones the lowest."""
     found: dict[int, dict[int, float]] = {}
     for task, label, number in zip(tasks, labels, frames, strict=True):
         of_task = found.setdefault(task, {})
@@ -183,7 +181,7 @@ def _pairs(number: int) -> int:
 
 
 def _delays(labelling: Labelling) -> Tensor:
-    """Return the frames from each change to the first alarm that counts for it, float64 [changes]; NaN without."""
+    """Return the frames from each change to its first alarm, float64 [changes], or NaN."""
     labelling.check_hidden()
     labelling.check_one_task_each()
     ends = labelling.frames.cumsum(0)

@@ -2,17 +2,17 @@
 
 New et al. 2022 and Baker et al. 2023 define them on regimes: stays on one task, either training or evaluation, each
 with the performance of its experiences in order. An experience is an episode there, a training interval of a run's log
-here. l2metrics first smooths training and scales each task to 1..101: `prepare`. Its scale depends on the run unless
-ranges are given, and its offset of 1 makes ratios: from 0 to half of the range is a "forward transfer" of 51. Give
-ranges, and read ratios of sparse rewards with care, or take contrasts of unscaled performance.
+here. l2metrics first smooths training and scales each task to 1..101: `prepare`. Without given ranges the scale depends
+on the run, and its offset of 1 makes ratios: from 0 to half of the range is a "forward transfer" of 51. Give ranges, or
+take contrasts of unscaled performance.
 
-Means leave out tasks and pairs without a value as l2metrics does; here they are counted. Deliberate deviations:
+As in l2metrics means leave out tasks and pairs without a value; here they are counted. Deliberate deviations:
 
-- Where other tasks are trained between the two evaluations of a transfer, its cause is not known. l2metrics
-  keeps the last of them, direct learning included; here there is no value.
-- Ratios and contrasts of negative performance, in which an improvement may read as a loss, have no value here; nor has
-  a relative performance whose expert has the sum 0, which is infinite there.
-- Values that differ by rounding are equal: a plateau is reached at its start. There, the last bit decides.
+- Where other tasks are trained between the two evaluations of a transfer, there is no value; l2metrics keeps the last
+  of them, direct learning included.
+- Ratios and contrasts of negative performance, which may read improvement as loss, have no value; nor has a relative
+  performance whose expert has the sum 0, infinite there.
+- Values that differ by rounding are equal: a plateau is reached at its start.
 - Of several experts of a task, one without a value makes the task's undefined; l2metrics leaves that expert out.
 """
 
@@ -51,7 +51,7 @@ Measure = Callable[[Any, Any], Any]
 
 
 def smooth(values: Tensor) -> Tensor:
-    """Moving average over a fifth of the values, at most 100, mirrored at both ends; untouched below 15 values."""
+    """Moving average over a fifth of the values, at most 100, mirrored at both ends; unchanged below 15 values."""
     window = min(int(len(values) * 0.2), LONGEST_WINDOW)
     if window < 3:
         return values
@@ -67,9 +67,9 @@ def prepare(regimes: Regimes, experts: Experts | None = None, ranges: Ranges | N
 
     Args:
         regimes: a run.
-        experts: for each task, the training curves of its experts.
-        ranges: lowest and highest performance of each task; by default those of the smoothed run and its experts. A
-            task with an empty range is 1 throughout.
+        experts: each task's experts' training curves.
+        ranges: lowest and highest performance of each task; by default of the smoothed run and its experts. An empty
+            range gives 1 throughout.
     """
     table = RegimeTable.of(regimes)
     values = table.values.clone()
@@ -128,9 +128,9 @@ def mean_evaluation_performance(regimes: Regimes) -> Tensor:
 def performance_recovery(regimes: Regimes) -> Tensor:
     """PR: whether a task is recovered faster each time that it comes back; positive when it is.
 
-    The recovery time of a training regime is the number of experiences before the first one that is as good as the
-    terminal performance of the task's regime before, and one more than all of them if none is. The slope is
-    Theil-Sen's. A task needs three training regimes.
+    A training regime's recovery time is the number of experiences before the first one as good as the terminal
+    performance of the task's regime before; without one, one more than all. The slope is Theil-Sen's. A task needs
+    three training regimes.
     """
     table = RegimeTable.of(regimes)
     return float64([-theil_sen(recovery_times([table[i] for i in own])) for own in table.places(training=True)])
@@ -143,7 +143,7 @@ def performance_recovery(regimes: Regimes) -> Tensor:
     bounds=of_changes_on_scale(SCALE),
 )
 def maintenance_of_evaluation(regimes: Regimes) -> Tensor:
-    """PM (mrlep): change of a task's evaluations against the most recent one right after its training.
+    """PM (mrlep): change of a task's evaluations against the last one right after its training.
 
     Not negative when nothing is forgotten. A task that is trained last has no later evaluation.
     """
@@ -157,7 +157,7 @@ def maintenance_of_evaluation(regimes: Regimes) -> Tensor:
     bounds=of_changes_on_scale(SCALE),
 )
 def maintenance_of_training(regimes: Regimes) -> Tensor:
-    """PM (mrtlp): as `maintenance_of_evaluation`, against the terminal performance of the most recent training."""
+    """PM (mrtlp): as `maintenance_of_evaluation`, against the last training's terminal performance."""
     return _maintenance(RegimeTable.of(regimes), to_evaluation=False)
 
 
@@ -190,9 +190,9 @@ of_pairs = partial(
 def forward_transfer_ratio(regimes: Regimes) -> Tensor:
     """FT: what training a task a, before b's first training, does to the evaluations of b right before and after.
 
-    Of each pair only the first value counts. 1 is neutral. Pairs without evaluations around the training have no
-    value: without an evaluation before any training, all of the first task. Nor have those with tp(e1) = 0, however
-    large the gain: sparse rewards want `forward_transfer_contrast`.
+    Only the first value of a pair counts. 1 is neutral. Pairs without evaluations around the training have no value:
+    without an evaluation before any training, all of the first task. Nor have those with tp(e1) = 0, however large the
+    gain: sparse rewards want `forward_transfer_contrast`.
     """
     return _transfer(regimes, _quotients, forward=True)
 
@@ -227,8 +227,7 @@ def relative_performance(regimes: Regimes, experts: Experts) -> Tensor:
     Compares experiences with experiences, whatever their length.
 
     Args:
-        regimes: a run.
-        experts: for each task, the training curves of its experts; the mean over them counts.
+        experts: each task's experts' training curves; their mean counts.
     """
 
     table = RegimeTable.of(regimes)
@@ -253,13 +252,12 @@ def relative_performance(regimes: Regimes, experts: Experts) -> Tensor:
 def sample_efficiency(regimes: Regimes, experts: Experts) -> Tensor:
     """SE: how high and how soon training saturates against experts; 1 is neutral.
 
-    Saturation is the highest value of the smoothed curve over all training of a task. The term is 0 where it is below
-    a fifth of the expert's, or where the line fitted through the training falls. A curve that is best at its start has
-    no value, so a perfect jump-start has none.
+    Saturation is the highest value of the smoothed curve over a task's training. The term is 0 where it is below a
+    fifth of the expert's, or where the line fitted through the training falls. A curve that is best at its start has no
+    value.
 
     Args:
-        regimes: a run.
-        experts: for each task, the training curves of its experts; the mean over them counts.
+        experts: each task's experts' training curves; their mean counts.
     """
 
     table = RegimeTable.of(regimes)
@@ -282,25 +280,25 @@ def sample_efficiency(regimes: Regimes, experts: Experts) -> Tensor:
 
 
 def recovery_times(training: Regimes) -> list[int]:
-    """For each regime but the first, experiences until the terminal performance of the one before is reached again."""
+    """For each regime but the first, experiences until the terminal performance before it is reached again."""
     return [_first_at_least(after.values, before.terminal) for before, after in pairwise(training)]
 
 
 def theil_sen(values: Sequence[float]) -> float:
-    """Median slope over all pairs of values at the positions 0, 1, ...; NaN for fewer than two."""
+    """Median slope over all pairs of values at 0, 1, ...; NaN for fewer than two."""
     given = np.asarray(values, dtype=np.float64)
     slopes = [(given[lag:] - given[:-lag]) / lag for lag in range(1, len(given))]
     return float(np.median(np.concatenate(slopes))) if slopes else math.nan
 
 
 def _first_at_least(values: Tensor, level: float) -> int:
-    """Position of the first value that reaches a level, rounding apart; one more than all of them if none does."""
+    """Position of the first value that reaches a level, but for rounding; one more than all if none does."""
     reached = (values >= level - ROUNDING * abs(level)).nonzero()
     return int(reached[0]) if len(reached) else len(values) + 1
 
 
 def _maintenance(table: RegimeTable, to_evaluation: bool) -> Tensor:
-    """Mean over a task's evaluations that are no reference themselves of the change against the reference."""
+    """Mean change of a task's evaluations against the references among them."""
     training = table.training.tolist()
     terminal = table.terminal.tolist()
     last: list[float | None] = [None] * len(table.names)
@@ -320,7 +318,7 @@ def _maintenance(table: RegimeTable, to_evaluation: bool) -> Tensor:
 
 
 def _transfer(regimes: Regimes, measure: Measure, forward: bool) -> Tensor:
-    """The first value of every ordered pair (a, b) in which a is trained before, or after, b's first training."""
+    """First value of each ordered pair (a, b) with a trained before, or after, b's first training."""
     table = RegimeTable.of(regimes)
     count = len(table.names)
     trainings = list(table.places(training=True))
@@ -337,10 +335,10 @@ def _transfer(regimes: Regimes, measure: Measure, forward: bool) -> Tensor:
 
 
 def _values_around_training(table: RegimeTable, measure: Measure) -> tuple[Any, Any, Any]:
-    """Every two evaluations of a task in a row, with only blocks of one task between them, in order for each task.
+    """Each two evaluations of a task in a row with only blocks of one task between them, by task.
 
     Returns:
-        The position of the last training between, the number of the evaluated task and the value, [pairs] each.
+        The last training's position between, the evaluated task and the value, [pairs] each.
     """
     evaluated = np.flatnonzero(~table.training)
     trained = np.flatnonzero(table.training)
@@ -364,7 +362,7 @@ def _saturation(values: Tensor) -> tuple[float, int]:
 
 
 def _falls(table: RegimeTable, trainings: Sequence[int]) -> bool:
-    """Whether the least-squares line through a task's training falls, over the experiences of the whole run."""
+    """Whether the least-squares line through a task's training falls."""
     times = torch.cat([torch.arange(table.starts[i], table.starts[i + 1], device="cpu") for i in trainings]).double()
     values = _joined(table, trainings)
     return bool(((times - times.mean()) * (values - values.mean())).sum() < 0)
@@ -375,7 +373,7 @@ def _joined(table: RegimeTable, places: Sequence[int]) -> Tensor:
 
 
 def _against(table: RegimeTable, experts: Experts, value: Callable[[Sequence[Tensor], list[int]], float]) -> Tensor:
-    """A value for each task that is trained, in the order of first appearance; NaN for one without experts."""
+    """A value for each trained task, by first appearance; NaN for one without experts."""
     values = []
     for task, own in zip(table.names, table.places(training=True), strict=True):
         if own:

@@ -1,8 +1,8 @@
 """Metrics of the performance matrix.
 
 ``performance[i, j]`` is the performance on task j after block i, float64 [blocks + 1, tasks]; row 0 is before any
-training; NaN is "not evaluated". ``trained`` has the tasks of each block, counted from 0; without it, block i is taken
-to train task i. A NaN that a formula needs makes the metric undefined: nothing is imputed, and no older row steps in.
+training; NaN is "not evaluated". ``trained`` has the tasks of each block, counted from 0; without it, block i trains
+task i. A NaN that a formula needs makes the metric undefined.
 """
 
 from __future__ import annotations
@@ -28,10 +28,7 @@ ONE_TASK = "the definition needs at least two tasks"
 
 @defined("lopez-paz2017/acc", "1/T sum_j R[T,j]", LOPEZ_PAZ, bounds=of_performance)
 def average_performance(performance: Tensor, trained: Trained | None = None) -> Tensor:
-    """ACC = 1/T sum_j R[last, j]: mean performance on all tasks after the last block.
-
-    Defined for any curriculum.
-    """
+    """ACC = 1/T sum_j R[last, j]: mean performance on all tasks after the last block, for any curriculum."""
     return performance[-1]
 
 
@@ -39,8 +36,8 @@ def average_performance(performance: Tensor, trained: Trained | None = None) -> 
 def forward_transfer(performance: Tensor, trained: Trained | None = None) -> Tensor:
     """FWT = 1/(T-1) sum_{j>1} (R[j-1, j] - R[0, j]).
 
-    What training on the tasks before it gave a task before its own block, against the untrained agent (the b_j of the
-    source). Undefined as `backward_transfer`, and without the evaluation before any training.
+    The gain of a task before its own block by the tasks before it, against the untrained agent (the b_j of the source).
+    Undefined as `backward_transfer`, and without the evaluation before any training.
     """
     _several_in_order(performance, trained)
     _has_initial_evaluation(performance[:, 1:])
@@ -69,8 +66,8 @@ def backward_transfer(performance: Tensor, trained: Trained | None = None) -> Te
 def forgetting(performance: Tensor, trained: Trained | None = None) -> Tensor:
     """F = 1/(T-1) sum_{j<T} (max_{1<=l<T} R[l, j] - R[T, j]).
 
-    The drop on each earlier task from its best after any earlier block to the end; the untrained agent (row 0) is no
-    candidate for the best. Undefined as `backward_transfer`.
+    The drop on each earlier task from its best after any earlier block, not row 0, to the end. Undefined as
+    `backward_transfer`.
     """
     _several_in_order(performance, trained)
     best = performance[1:-1].amax(dim=0)
@@ -81,7 +78,7 @@ def forgetting(performance: Tensor, trained: Trained | None = None) -> Tensor:
 def accuracy_over_time(performance: Tensor, trained: Trained | None = None) -> Tensor:
     """A: mean over all pairs of a block i and a task j that was trained by then.
 
-    Undefined unless each task is trained once, in a block without others, in order. Defined for a single task.
+    Undefined as `backward_transfer`, but defined for a single task.
     """
     _in_order(performance, trained)
     return _pairs(performance, torch.ge)
@@ -106,7 +103,7 @@ def backward_transfer_over_time(performance: Tensor, trained: Trained | None = N
 def remembering(performance: Tensor, trained: Trained | None = None) -> Tensor:
     """REM = 1 - |min(BWT, 0)| with BWT of `backward_transfer_over_time`; 1 without forgetting.
 
-    In [0, 1] for performance in [0, 1], as the source assumes. The terms are those of BWT.
+    In [0, 1] for performance in [0, 1], as the source assumes.
     """
     return _changes_after_own_block(performance, trained)
 
@@ -119,15 +116,15 @@ def remembering(performance: Tensor, trained: Trained | None = None) -> Tensor:
     bounds=of_gains,
 )
 def positive_backward_transfer(performance: Tensor, trained: Trained | None = None) -> Tensor:
-    """BWT+ = max(BWT, 0) with BWT of `backward_transfer_over_time`. The terms are those of BWT."""
+    """BWT+ = max(BWT, 0) with BWT of `backward_transfer_over_time`."""
     return _changes_after_own_block(performance, trained)
 
 
 @defined("diaz-rodriguez2018/fwt", "2/(T(T-1)) sum_{i<j} R[i,j]", DIAZ, bounds=of_performance)
 def zero_shot_performance(performance: Tensor, trained: Trained | None = None) -> Tensor:
-    """FWT: mean performance on tasks that are yet to be trained, after each block; row 0 is not part of it.
+    """FWT: mean performance on tasks that are yet to be trained, after each block but row 0.
 
-    Not the same as `forward_transfer`: nothing is subtracted. Undefined as `backward_transfer`.
+    Unlike `forward_transfer` nothing is subtracted. Undefined as `backward_transfer`.
     """
     _several_in_order(performance, trained)
     return _pairs(performance, torch.lt)
@@ -143,16 +140,15 @@ def zero_shot_performance(performance: Tensor, trained: Trained | None = None) -
 def isolated_forgetting(performance: Tensor, trained: Trained | None = None, scale: Tensor | None = None) -> Tensor:
     """F: what one block of another task takes from a task that was trained before; positive when it is forgotten.
 
-    The source smooths curves over 20 evaluations first: `Curves.smoothed`; its tables show the value times 10. Tasks
-    may be trained again: blocks of other tasks after the first training count, and none that trains the task itself.
-    The source's code counts only the first cycle of tasks, or of more cycles a task's own later trainings, too.
-    Undefined where a block trains several tasks, and for a single task.
+    The source first smooths curves over 20 evaluations, `Curves.smoothed`; its tables show the value times 10. Blocks
+    of other tasks after a task's first training count. The source's code counts only the first cycle of tasks, or of
+    more cycles a task's own later trainings, too. Undefined where a block trains several tasks, and for a single task.
 
     Args:
         performance: the matrix.
         trained: the tasks of each block.
-        scale: for each task, what changes are divided by; default: max |R[i, task]| of this matrix. The source takes
-            it over all seeds of a model, which makes values of two models no longer comparable: give the known optimum.
+        scale: what each task's changes are divided by; default: max |R[i, task]| of this matrix. The source takes it
+            over all seeds of a model, so that models are not comparable: give the known optimum.
     """
     return _changes_by_others(performance, trained, scale, before=False) * -1
 
@@ -180,7 +176,7 @@ def _changes_after_own_block(performance: Tensor, trained: Trained | None) -> Te
 
 
 def _pairs(matrix: Tensor, chosen: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-    """Entries [block, task] of the rows 1.. for which ``chosen(block, task)`` holds, row by row."""
+    """Entries [block, task] of the rows 1.. with ``chosen(block, task)``, row by row."""
     count = torch.arange(matrix.shape[1], device="cpu")
     return matrix[1 : len(count) + 1][chosen(count.unsqueeze(1), count)]
 
@@ -220,7 +216,7 @@ def _blocks(performance: Tensor, trained: Trained | None) -> list[list[int]]:
     """The tasks of each block; without ``trained`` a block per task.
 
     Raises:
-        ValueError: if the matrix has not a row for each block and one before.
+        ValueError: if the matrix has not one row more than blocks.
     """
     blocks = performance.shape[0] - 1
     tasks = performance.shape[1]

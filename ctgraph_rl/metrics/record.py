@@ -1,4 +1,4 @@
-"""A metric as a record: the value with what it means, or the reason why there is none."""
+"""A metric as a record: the value with its meaning, or the reason why there is none."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from ctgraph_rl.metrics.bounds import BoundsOf, unbounded
 from ctgraph_rl.metrics.inputs import INPUTS
 
 HERE = "ctgraph_rl"
-"""Source of what is defined here."""
+"""Source of definitions of this package."""
 
 MASTERED = 0.9
-"""Share of episodes, or of the optimal value, from which on something counts as mastered."""
+"""Share of episodes, or of the optimal value, that counts as mastered."""
 
 TENSORS = ("Tensor", "Tensor | None", Tensor, Tensor | None)
-"""Annotations of tensors, as text where a module postpones them."""
+"""Annotations of tensors, also as text."""
 
 Arguments = ParamSpec("Arguments")
 
@@ -36,8 +36,8 @@ class Definition:
         id: short name of source and metric, such as ``lopez-paz2017/bwt``.
         formula: the formula; tasks and blocks are counted from 1.
         source: where it is defined.
-        partial: whether terms without a value are left out of the mean, and counted, as the source does; else one of
-            them makes the metric undefined.
+        partial: whether terms without a value are left out of the mean, and counted; else one makes the metric
+            undefined.
     """
 
     id: str
@@ -48,16 +48,16 @@ class Definition:
 
 @dataclass(frozen=True)
 class Metric:
-    """A metric's value with what it means.
+    """A metric's value with its meaning.
 
     Args:
-        value: the value, in units of performance; None when undefined.
+        value: in units of performance; None when undefined.
         definition: id of the definition.
-        formula: the formula, with R for the performance matrix and tasks counted from 1.
+        formula: with R for the performance matrix and tasks counted from 1.
         source: where it is defined.
         undefined: why there is no value.
-        n_undefined: number of terms of the formula without a value.
-        terms: the terms, in order; None for those without a value.
+        n_undefined: number of terms without a value.
+        terms: in order; None for those without a value.
     """
 
     value: float | None
@@ -70,34 +70,34 @@ class Metric:
 
 
 class Entry(NamedTuple):
-    """A metric with what it is computed from."""
+    """A metric with its inputs."""
 
     metric: Callable[..., Metric]
     meaning: Definition
     inputs: dict[str, str]
-    """For each argument that is given an input, the name of that in `INPUTS`."""
+    """Names in `INPUTS` by argument."""
     required: tuple[str, ...]
-    """The inputs without which there is no metric."""
+    """Inputs without which there is no metric."""
     bounds: BoundsOf = unbounded
-    """The lowest and the highest value that a run can have."""
+    """Lowest and highest value of a run."""
     is_time: bool = False
-    """Whether it is a time, infinite in a run that never got there: where terms have no value."""
+    """Whether it is a time, infinite in a run that never got there."""
     is_exact: bool = False
-    """Whether it follows from the curriculum: every run has the same value, which has no interval."""
+    """Whether it follows from the curriculum, with one value for all runs."""
 
     def of(self, given: Mapping[str, Any]) -> Metric:
-        """Compute the metric of inputs by name; undefined where one of them is `Undefined`, for its reason."""
+        """Compute the metric; undefined where an input is `Undefined`, for its reason."""
         arguments = {argument: given[name] for argument, name in self.inputs.items() if name in given}
         reasons = [str(value) for value in arguments.values() if isinstance(value, Undefined)]
         return undefined(self.metric, reasons[0]) if reasons else self.metric(**arguments)
 
 
 METRICS: dict[str, Entry] = {}
-"""Every metric by the name of its function."""
+"""Every metric by its function's name."""
 
 
 class Undefined(Exception):
-    """Raised by a function of terms where its definition says nothing; the message is the reason."""
+    """Raised where a definition says nothing; the message is the reason."""
 
 
 def defined(
@@ -115,27 +115,24 @@ def defined(
 ) -> Callable[[Callable[Arguments, Tensor]], Callable[Arguments, Metric]]:
     """Make a metric of a function that returns the terms of its formula, NaN for a term without a value.
 
-    It takes lists and NumPy arrays for tensors, too.
-
-    The metric is listed in `METRICS` and computed wherever there are its inputs: those of `INPUTS` that its arguments
-    are named after. An argument with a default is left at it where its input is missing, or where it is none.
+    It also takes lists and NumPy arrays, is listed in `METRICS`, and is computed wherever its inputs are there: those
+    of `INPUTS` that its arguments are named after. An argument with a default keeps it without its input.
 
     Args:
         definition: id of the definition.
         formula: the formula.
         source: where it is defined.
-        partial: see `Definition`.
-        missing: why a term may be without a value, or a function of the same arguments that says why terms are.
-        aggregate: makes the value of the terms; the mean of all but a few.
+        partial: as in `Definition`.
+        missing: why a term may lack a value, or a function of the same arguments that says why terms do.
+        aggregate: makes the value of the terms.
         inputs: the inputs of arguments with other names.
-        bounds: the lowest and the highest value, from what is known of a run; one of `ctgraph_rl.metrics.bounds`.
-            Intervals over seeds stay within.
-        is_time: whether it is a time, which runs that never get there have no value of.
-        is_exact: whether it follows from the curriculum, so that all runs have one value.
+        bounds: lowest and highest value, one of `ctgraph_rl.metrics.bounds`. Intervals over seeds stay within.
+        is_time: as in `Entry`.
+        is_exact: as in `Entry`.
 
     Raises:
-        ValueError: for a function without inputs, an argument without default that is no input or whose name is nearly
-            that of one, and a name or an id that another metric has.
+        ValueError: for a function without inputs, an argument without default that is no input or nearly the name of
+            one, and a name or id that another metric has.
     """
     meaning = Definition(definition, formula, source, partial)
 
@@ -167,7 +164,7 @@ def defined(
 
 
 def _entry(metric: Callable[..., Metric], meaning: Definition, renamed: Mapping[str, str]) -> Entry:
-    """Return a metric with the inputs of its arguments, to be listed."""
+    """Return a metric with the inputs of its arguments."""
     name = metric.__name__
     arguments = signature(metric).parameters
     inputs = {}
@@ -195,7 +192,7 @@ def _entry(metric: Callable[..., Metric], meaning: Definition, renamed: Mapping[
 
 
 def undefined(metric: Callable[..., Metric], reason: str) -> Metric:
-    """Return a metric without a value, for a reason that its arguments cannot show."""
+    """Return a metric without a value, for a reason beyond its arguments."""
     meaning: Definition = metric.definition  # type: ignore[attr-defined]
     return Metric(None, meaning.id, meaning.formula, meaning.source, reason)
 

@@ -1,4 +1,4 @@
-"""Regimes, which are stays on one task, and a table of many of them."""
+"""Regimes, stays on one task, and a table of many."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class Regime:
 
     Args:
         task: name of the task.
-        training: True for training, False for an evaluation.
+        training: False for an evaluation.
         values: performance of each experience in order, float64 [experiences].
 
     Raises:
-        ValueError: for no values, or one that is not finite.
+        ValueError: for no values, or infinite ones.
     """
 
     task: str
@@ -36,13 +36,13 @@ class Regime:
 
     @property
     def terminal(self) -> float:
-        """Terminal performance: mean of the last tenth of a training, of all of an evaluation."""
+        """Terminal performance: mean of a training's last tenth, or of an evaluation."""
         start = int((1 - 0.1) * len(self.values)) if self.training else 0
         return self.values[start:].mean().item()
 
 
 class Column(NamedTuple):
-    """What `RegimeTable` holds of each regime."""
+    """`RegimeTable`'s entry of a regime."""
 
     task: Any  # position of its task in the names
     training: Any  # bool
@@ -53,7 +53,7 @@ class RegimeTable(Sequence[Regime]):
     """Regimes as arrays: a run that evaluates T tasks after each of T blocks has more than T^2 of them.
 
     Args:
-        names: the different tasks, in the order of first appearance.
+        names: the different tasks, by first appearance.
         columns: the regimes in order.
         values: the experiences of all regimes in order, float64 [experiences].
 
@@ -90,7 +90,7 @@ class RegimeTable(Sequence[Regime]):
         return cls([*names], Column(*(columns if regimes else ((), (), ()))), values)
 
     def replaced(self, values: Tensor) -> RegimeTable:
-        """Return the table with other values of the same experiences."""
+        """Return the table with other values."""
         return RegimeTable(self.names, Column(self.task, self.training, self.length), values)
 
     def __len__(self) -> int:
@@ -107,14 +107,14 @@ class RegimeTable(Sequence[Regime]):
 
     @cached_property
     def terminal(self) -> Any:
-        """`Regime.terminal` of each regime, float64 [regimes]."""
+        """`Regime.terminal`, float64 [regimes]."""
         found = self.values[torch.from_numpy(self.starts[:-1])].double().numpy().copy()
         for place in np.flatnonzero(self.length > 1).tolist():
             found[place] = self[place].terminal
         return found
 
     def places(self, training: bool) -> Iterator[list[int]]:
-        """Yield, for each task, the positions of its trainings or evaluations."""
+        """Yield each task's positions of trainings or evaluations."""
         own = np.flatnonzero(self.training == training)
         order = own[np.argsort(self.task[own], kind="stable")]
         ends = np.searchsorted(self.task[order], range(len(self.names) + 1))

@@ -1,8 +1,7 @@
 """Forward transfer against experts, by areas under evaluation curves.
 
-Areas under a curve are means of its evaluations or trapezoids, as a definition says; both need evaluations at equal
-distances. An expert is an agent that learned a single task, with the frames and evaluations that the task has in the
-curriculum; its curve is an argument.
+Areas under a curve are means of its evaluations or trapezoids; both need evaluations at equal distances. An expert
+learned a single task, with the frames and evaluations that the task has in the curriculum.
 """
 
 from __future__ import annotations
@@ -18,22 +17,21 @@ from ctgraph_rl.metrics.curves import CONTINUAL_WORLD, LABS_CODE, Curves
 from ctgraph_rl.metrics.record import Undefined, defined, ratio
 
 SMALLEST_HEADROOM = 1e-3
-"""1 - area of an expert below which the labs' code gives no forward transfer."""
+"""1 - an expert's area below which the labs' code gives no forward transfer."""
 
 
 def mean_area(curve: Tensor) -> Tensor:
-    """Area under a curve over its length, as the plain mean of its evaluations (Continual World's code).
+    """Area under a curve over its length, as the mean of its evaluations (Continual World's code).
 
     Args:
-        curve: evaluations along the first dimension, such as of a stage.
+        curve: evaluations along the first dimension.
     """
     return curve.mean(0)
 
 
 def trapezoid_area(curve: Tensor) -> Tensor:
-    """Area under a curve over its length by trapezoids, divided by the number of intervals (the CT-graph labs' code).
-
-    NaN for fewer than two evaluations.
+    """Area under a curve over its length by trapezoids, per interval (the labs' code); NaN for fewer than two
+    evaluations.
     """
     return (curve[1:] + curve[:-1]).mean(0) / 2
 
@@ -56,7 +54,7 @@ def stage_areas(curves: Curves, trapezoids: bool = False) -> Tensor:
 
 
 def _no_transfer(areas: Tensor, expert_areas: Tensor, smallest_headroom: float = 0.0) -> str:
-    """Return each cause of terms without a value, with the tasks that it concerns."""
+    """Return each cause of terms without a value, with its tasks."""
     own, expert = _over_seeds(areas, expert_areas)
     causes = {
         "an evaluation is missing": own.isnan() | expert.isnan(),
@@ -71,7 +69,7 @@ def _over_seeds(*areas: Tensor) -> list[Tensor]:
 
 
 def _is_full(expert_areas: Tensor, smallest_headroom: float) -> Tensor:
-    """bool [tasks]: whether an expert leaves nothing to gain, or less than the smallest headroom."""
+    """bool [tasks]: whether an expert leaves less to gain than the smallest headroom, or nothing."""
     headroom = 1 - expert_areas
     return (headroom == 0) | (headroom < smallest_headroom)
 
@@ -84,15 +82,14 @@ def _is_full(expert_areas: Tensor, smallest_headroom: float) -> Tensor:
     bounds=at_most_1,
 )
 def continual_world_forward_transfer(areas: Tensor, expert_areas: Tensor) -> Tensor:
-    """FT: what a task's own block gains by what came before, as a share of what was left to gain; at most 1.
+    """FT: the gain of a task's own block by what came before, as a share of the possible gain; at most 1.
 
-    AUC of `stage_areas`, for performance whose best is 1, such as success rates. The source first averages areas over
-    seeds: a ratio of means, not a mean of ratios. An expert with an area of 1 makes it undefined; the source's code
-    divides by zero there.
+    AUC of `stage_areas`, for performance whose best is 1, such as success rates. The source takes a ratio of means over
+    seeds, not a mean of ratios. Undefined for an expert with an area of 1, where the source's code divides by zero.
 
     Args:
-        areas: float64 [tasks], or [seeds, tasks] to be averaged over seeds.
-        expert_areas: the same of the experts, whose seeds may be others.
+        areas: float64 [tasks], or [seeds, tasks] to be averaged.
+        expert_areas: the same of the experts, of any seeds.
     """
     own, expert = _over_seeds(areas, expert_areas)
     return ratio(own - expert, 1 - expert)
@@ -120,7 +117,7 @@ def forward_transfer_from_experts(areas: Tensor, expert_areas: Tensor) -> Tensor
 
 
 def check_experts(curves: Curves, experts: Sequence[Tensor]) -> None:
-    """Refuse expert curves that were not evaluated as often as the tasks in the block that trains them first.
+    """Refuse expert curves with another number of evaluations than the block that trains the task first.
 
     Raises:
         ValueError: names the task and both numbers.

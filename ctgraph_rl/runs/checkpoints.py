@@ -1,8 +1,7 @@
 """Checkpoints that can be trusted: whole files with a checksum, the last two kept, read without running any code.
 
-A file is one line of JSON, ``{"format": 1, "frames": ..., "bytes": ..., "sha256": ...}``, and what `torch.save` makes
-of plain tensors and Python values. It is read only if length and checksum agree, and by ``weights_only=True``, which
-refuses anything else.
+A file is one line of JSON, ``{"format": 1, "frames": ..., "bytes": ..., "sha256": ...}``, and `torch.save` of plain
+tensors and Python values. Length and checksum must agree, and ``weights_only=True`` refuses anything else.
 """
 
 from __future__ import annotations
@@ -26,16 +25,16 @@ from ctgraph_rl.log.sums import sum_of
 from ctgraph_rl.runs.interrupt import Interrupt
 
 FORMAT = 1
-"""Raised when the meaning of a checkpoint changes."""
+"""Rises when the meaning of a checkpoint changes."""
 
 KEPT = 2
-"""Checkpoints that are kept, the newest."""
+"""Newest checkpoints that stay."""
 
 SECONDS = 300.0
-"""Time between two checkpoints within a block, where nothing else is said."""
+"""Default time between checkpoints within a block."""
 
 RunState = Mapping[str, Any]
-"""What is saved: tensors and plain Python values, nested; ``frames`` is the number of frames of the run so far."""
+"""Tensors and plain Python values, nested; ``frames`` is the run's frames so far."""
 
 
 NOT_PLAIN = "a run can only be saved where the agent's state_dict() holds tensors and plain Python values"
@@ -46,13 +45,12 @@ class BrokenCheckpoint(ValueError):
 
 
 class Checkpoints:
-    """The checkpoints of one run in a folder, which is made with the first one.
+    """The checkpoints of one run in a folder, made with the first.
 
     Args:
-        folder: where they are.
         seconds: time between two checkpoints within a block, >= 0.
-        strict: refuse to resume from an older checkpoint where the newest is broken, instead of warning.
-        interrupt: notices that the process was asked to stop: a checkpoint is then saved, and the process exits.
+        strict: refuse, instead of warn, to resume from an older checkpoint if the newest is broken.
+        interrupt: when the process is asked to stop, a checkpoint is saved and it exits.
 
     Raises:
         ValueError: for values out of range.
@@ -71,7 +69,7 @@ class Checkpoints:
     def offer(self, state: Callable[[], RunState], at_block_end: bool) -> None:
         """Save if it is time, called after every update.
 
-        The first one is saved at once, so that a full disk, or a state that cannot be read back, stops a run early.
+        The first one is saved at once, so that a full disk or an unreadable state stops a run early.
 
         Args:
             state: makes what is saved.
@@ -88,11 +86,11 @@ class Checkpoints:
         return at_block_end or self._last is None or time.monotonic() - self._last >= self.seconds
 
     def save(self, state: RunState) -> None:
-        """Write a checkpoint, then remove the oldest, and broken ones that a run has gone back behind.
+        """Write a checkpoint, then remove the oldest, and broken ones later than the run.
 
         Raises:
             OSError: if it cannot be written; names the sizes and the checkpoint that is kept.
-            ValueError: if the first one cannot be read back, for it holds more than tensors and plain values.
+            ValueError: if the first one cannot be read back, as it holds more than tensors and plain values.
         """
         path = self.path_of(state["frames"])
         content = encoded(state)
@@ -115,7 +113,7 @@ class Checkpoints:
             other.unlink(missing_ok=True)
 
     def path_of(self, frames: int) -> Path:
-        """Return the path of the checkpoint after so many frames."""
+        """Return the path of the checkpoint after ``frames``."""
         return self.folder / f"{frames:012d}.pt"
 
     def files(self) -> list[Path]:
@@ -129,15 +127,15 @@ class Checkpoints:
 
     @property
     def newest_frames(self) -> int | None:
-        """Frames after which the newest was made; None without one."""
+        """Frames of the newest, or None."""
         files = self.files()
         return _frames(files[0]) if files else None
 
     def newest(self) -> RunState | None:
-        """Return the newest sound checkpoint, None without one; warn of a broken one and skip it.
+        """Return the newest sound checkpoint or None; warn of broken ones.
 
         Raises:
-            BrokenCheckpoint: for a broken one, if ``strict``; and if there are some, but all are broken.
+            BrokenCheckpoint: for a broken one, if ``strict``; and if all are broken.
         """
         files = self.files()
         for file in files:
@@ -150,20 +148,20 @@ class Checkpoints:
         return None
 
     def clear(self) -> None:
-        """Remove all, for good."""
+        """Remove all durably."""
         if self.folder.exists():
             shutil.rmtree(self.folder, ignore_errors=True)
             sync_folder(self.folder.parent)
 
     def tidy(self) -> None:
-        """Remove what was being written when a process was killed."""
+        """Remove half-written files of a killed process."""
         require_no_link(self.folder)
         for part in self.folder.glob("*" + PART):
             part.unlink(missing_ok=True)
 
 
 def offer_all(checkpoints: Sequence[Checkpoints], states: Callable[[], Sequence[RunState]], at_block_end: bool) -> None:
-    """Save the states of runs that learn together as `Checkpoints.offer` does: all of them or none."""
+    """`Checkpoints.offer` for runs that learn together: all are saved or none."""
     first = checkpoints[0]
     stop = first.interrupt.is_asked
     if stop or first.is_due(at_block_end):
@@ -174,11 +172,11 @@ def offer_all(checkpoints: Sequence[Checkpoints], states: Callable[[], Sequence[
 
 
 def newest_of_all(checkpoints: Sequence[Checkpoints]) -> list[RunState] | None:
-    """Return the newest states of runs that learn together, all after as many frames; None if one has no checkpoint.
+    """Return the newest states of runs that learn together, after equal frames; None if one has no checkpoint.
 
     Raises:
-        BrokenCheckpoint: see `Checkpoints.newest`.
-        OSError: if a run has no checkpoint after as many frames as another's newest.
+        BrokenCheckpoint: as `Checkpoints.newest`.
+        OSError: if a run lacks a checkpoint after the frames of another's newest.
     """
     found = [each.newest() for each in checkpoints]
     states = [state for state in found if state is not None]
@@ -209,7 +207,7 @@ def decoded(path: Path) -> RunState:
     """Read a checkpoint, its tensors on the CPU.
 
     Raises:
-        BrokenCheckpoint: if it is torn, changed, of another format, or holds more than tensors and plain values.
+        BrokenCheckpoint: if it is torn, changed, of another format, or not plain.
     """
     advice = "delete it to resume from the one before"
     try:

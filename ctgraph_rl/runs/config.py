@@ -1,4 +1,4 @@
-"""Hydra's side of a run: what its configuration says, its name, and what its settings build."""
+"""Hydra's side of a run: its configuration, its name, and what its settings build."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from ctgraph_rl.tasks.curriculum import Curriculum
 
 IS_NEXT_HYDRA = hasattr(hydra.utils, "execution_whitelist")
-"""Is it Hydra 1.4 or later, which has OmegaConf 2.4 or later?"""
+"""Whether it is Hydra 1.4 or later, with OmegaConf 2.4 or later."""
 
 PARTS = {"evaluation": "every=5120", "protocol": "task_id=one_hot"}
 """The groups that change a curriculum, each with an example."""
@@ -57,24 +57,24 @@ PARTS = {"evaluation": "every=5120", "protocol": "task_id=one_hot"}
 RESUME = ("warn", "strict")
 
 STALE = "stale"
-"""Of ``overwrite``: only what was run with other code is run again."""
+"""Of ``overwrite``: run again only what was run with other code."""
 
 RENEWED: tuple[type, ...] = (GlobalHydra, JobRuntime, VersionBase)  # of Hydra's state: what composing changes
 _HYDRA = threading.RLock()  # is held while Hydra's global state is ours
 
 
 SEEDS_APART = 1000
-"""Between the seeds of two members of a collective, so that a collective of another seed has other ones."""
+"""Between seeds of a collective's members, so that collectives share none."""
 
 NOT_HASHED = (
     *("overwrite", "experts_dir", "resume", "checkpoint_seconds"),
     *("logger", "objective", "report", "together", "seeds", "track"),
 )
-"""Keys of the configuration that do not change results."""
+"""Keys that do not change results."""
 
 
 def of_hydra(function: Function) -> Function:
-    """Return a function of Hydra that behaves as in 1.3: later ones do, and want no ``version_base``."""
+    """Return a function of Hydra that behaves as in 1.3, without ``version_base``."""
     return function if IS_NEXT_HYDRA else partial(function, version_base="1.3")  # type: ignore[return-value]
 
 
@@ -82,7 +82,7 @@ _PACKAGE = re.compile(r"(?:_target_|path): ['\"]?(\w+)")  # of a target, or of a
 
 
 def plain(cfg: DictConfig) -> NamedValues:
-    """Return the configuration as plain values, without Hydra's own and what does not change results."""
+    """Return the configuration as plain values, without Hydra's and those that do not change results."""
     kept = [str(key) for key in cfg if key != "hydra" and key not in NOT_HASHED]
     return OmegaConf.to_container(OmegaConf.masked_copy(cfg, kept), resolve=True)  # type: ignore[return-value]
 
@@ -93,7 +93,7 @@ def run_name(*, _root_: DictConfig) -> str:
 
 
 def name_of(cfg: DictConfig, choices: Any) -> str:
-    """Return the name of a configuration's run, given the chosen file of each group."""
+    """Return a configuration's run name, given each group's chosen file."""
     parts = {"cell": (None, "lstm"), "method": ("finetune",), "detector": (None,), "exchange": (None, "null")}
     learner = choices.agent
     for group, usual in parts.items():
@@ -104,11 +104,10 @@ def name_of(cfg: DictConfig, choices: Any) -> str:
 
 
 def of_seed(cfg: DictConfig, seed: int, run_dir: Path) -> tuple[DictConfig, Path]:
-    """Return the configuration of one seed of a job for several, and its directory.
+    """Return the configuration and directory of one seed of a job.
 
     Args:
         cfg: the configuration of the job, with its first seed.
-        seed: the seed.
         run_dir: the directory of the first seed.
     """
     choices = HydraConfig.get().runtime.choices
@@ -121,15 +120,15 @@ def of_seed(cfg: DictConfig, seed: int, run_dir: Path) -> tuple[DictConfig, Path
 
 
 def of_member(cfg: DictConfig, number: int, settings: ReadOnlyValues) -> DictConfig:
-    """Return the configuration of a member of a collective: its seed, and its curriculum if they differ.
+    """Return the configuration of a collective's member: its seed, and its curriculum if they differ.
 
     Args:
         cfg: the configuration of the collective.
         number: the member, from 0.
-        settings: those that only this member has, such as ``{"agent.learning_rate": 0.01}``.
+        settings: only this member's, such as ``{"agent.learning_rate": 0.01}``.
 
     Raises:
-        ValueError: for a setting that there is not.
+        ValueError: for an unknown setting.
     """
     own = deepcopy(cfg)
     own.seed = cfg.seed + SEEDS_APART * number if is_int(cfg.seed) else cfg.seed
@@ -145,7 +144,7 @@ def of_member(cfg: DictConfig, number: int, settings: ReadOnlyValues) -> DictCon
 
 
 def register_run_name() -> None:
-    """Let ``${run_name:}`` of a configuration be `run_name`, in this process."""
+    """Make `run_name` the resolver of ``${run_name:}`` in this process."""
     if IS_NEXT_HYDRA:
         OmegaConf.register_resolver("run_name", run_name, replace=True)  # type: ignore[call-arg]
     else:
@@ -153,7 +152,7 @@ def register_run_name() -> None:
 
 
 def in_sweep() -> bool:
-    """Return whether this run is a cell of a sweep, which reports on its cells itself."""
+    """Return whether this run is a cell of a sweep, which reports itself."""
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
@@ -161,7 +160,7 @@ def check_one_cell() -> None:
     """Refuse to run one cell in place of a sweep.
 
     Raises:
-        ValueError: without ``-m``, for what only a sweeper can do.
+        ValueError: without ``-m``, for a sweeper's settings.
     """
     if in_sweep():
         return
@@ -182,10 +181,10 @@ def check_one_cell() -> None:
 
 
 def check_resolved(cfg: DictConfig) -> None:
-    """Refuse a configuration with a setting that has no value: ``???``, or what no resolver finds.
+    """Refuse settings without a value: ``???``, or unresolved.
 
     Raises:
-        OmegaConfBaseException: names the setting; see `explain`.
+        OmegaConfBaseException: names the setting, for `explain`.
     """
     for key in cfg:
         value = None if key == "hydra" else cfg[key]
@@ -233,12 +232,12 @@ def check_values(cfg: DictConfig) -> None:
 
 
 def check_overwrite(given: Any) -> Rule:
-    """Return the rule of ``overwrite`` with its message."""
+    """Return the rule of ``overwrite``."""
     return isinstance(given, bool) or given == STALE, f"overwrite must be true, false or {STALE}, got {given!r}"
 
 
 def changes_of(cfg: DictConfig, part: str) -> NamedValues:
-    """Return what ``evaluation`` or ``protocol`` of a configuration changes; null changes nothing.
+    """Return the changes of a configuration's ``evaluation`` or ``protocol``; null changes nothing.
 
     Raises:
         ValueError: for a part without keys.
@@ -252,7 +251,7 @@ def target(cfg: DictConfig, group: str) -> Callable[..., Any]:
     """Return what builds a group of the configuration, with its arguments bound.
 
     Raises:
-        ValueError: for an argument that the target does not take, with the one that was probably meant or the choices.
+        ValueError: for an unknown argument, with the likely one or the choices.
     """
     given = [str(key) for key in cfg[group] if not str(key).startswith("_")]
     check_arguments(group, given, hydra.utils.get_object(cfg[group]["_target_"]))
@@ -261,10 +260,10 @@ def target(cfg: DictConfig, group: str) -> Callable[..., Any]:
 
 
 def _allowed_targets(group: DictConfig) -> AbstractContextManager[Any]:
-    """Let Hydra 1.4 call what is of any package but Python's standard library, which has functions that do harm.
+    """Let Hydra 1.4 call any package but Python's standard library, which has functions that do harm.
 
     Args:
-        group: a group of the configuration, whose targets may be of modules that are not imported yet.
+        group: of the configuration; its targets' modules may not be imported yet.
     """
     if not IS_NEXT_HYDRA:
         return nullcontext()  # it refuses what it knows to do harm
@@ -305,7 +304,7 @@ def curriculum_of(name: str, config_dir: Path | None = None) -> Curriculum:
 
 
 def composed(settings: Sequence[str], config_dir: Path | None = None) -> DictConfig:
-    """Return the configuration of a command line; the Hydra of a program that uses it itself stays as it was.
+    """Return the configuration of a command line, leaving a program's own Hydra unchanged.
 
     Args:
         settings: such as ``agent=ppo``.
@@ -318,10 +317,9 @@ def composed(settings: Sequence[str], config_dir: Path | None = None) -> DictCon
 
 @contextmanager
 def _hydra_of_its_own() -> Iterator[None]:
-    """Let Hydra start from nothing, in one thread at a time, and put back what it was.
+    """Let Hydra start from nothing, in one thread at a time, and then restore a program's own Hydra.
 
-    A program's own Hydra then keeps its ``version_base`` and the name of its job, on which the directories of its
-    further jobs depend, and its resolvers.
+    Its ``version_base``, resolvers and job name, on which further directories depend, stay.
     """
     with _HYDRA:
         singletons = {kind: Singleton._instances.pop(kind) for kind in RENEWED if kind in Singleton._instances}
@@ -338,10 +336,10 @@ def _hydra_of_its_own() -> Iterator[None]:
 
 
 def with_names(names: Mapping[str, str | None], config_dir: Path | None = None) -> DictConfig:
-    """Return the configuration with other choices of some groups, such as ``{"agent": "dqn"}``; None: the default.
+    """Return the configuration with other choices of groups, such as ``{"agent": "dqn"}``; None: the default.
 
     Raises:
-        ValueError: for an unknown name, with the one that was probably meant, and a path that is not a directory.
+        ValueError: for an unknown name, with the likely one, and a path that is no directory.
     """
     is_folder = config_dir is None or config_dir.is_dir()
     require((is_folder, f"config_dir must be a directory, got {config_dir}"))
@@ -360,7 +358,7 @@ def with_names(names: Mapping[str, str | None], config_dir: Path | None = None) 
 
 
 def write_configuration(cfg: DictConfig, folder: Path) -> None:
-    """Write the files that Hydra writes, but only after all checks."""
+    """Write Hydra's files, after all checks."""
     make_folder(folder)
     save_yaml(cfg, folder / "config.yaml")
     if HydraConfig.initialized():

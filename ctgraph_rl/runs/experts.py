@@ -1,7 +1,7 @@
 """Single-task experts: each learned one task of a curriculum, by the same agent with the same budget and protocol.
 
-Forward transfer and relative performance compare with them. An expert is a run like any other; it is kept in a folder
-under the hash of all that its numbers depend on, so that no run trains it twice.
+Forward transfer and relative performance compare with them. An expert is a run in a folder under the hash of all that
+its numbers depend on, so that it is trained once.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ RunDirs = Mapping[int, Path]
 """The directory of each seed."""
 
 Learn = Callable[[Curriculum, RunDirs, Session], Failures]
-"""Lets seeds learn a curriculum as one batch, or resumes what they began as one, each into its locked directory."""
+"""Lets seeds learn a curriculum as one batch, or resume, each into its locked directory."""
 
 EXPERT = "single-task expert"
-"""The name of their curricula."""
+"""The name of experts' curricula."""
 
 
 class Expert(NamedTuple):
@@ -46,7 +46,7 @@ class Expert(NamedTuple):
 
     @property
     def about(self) -> NamedValues:
-        """Plain values for the log; ``together`` where it was trained in a group of seeds."""
+        """Plain values for the log; ``together`` if it was trained in a group of seeds."""
         together = begun_with(self.run_dir)
         group = {"together": together} if together else {}
         return {"task": self.task, "fingerprint": self.fingerprint, "run": str(self.run_dir), **group}
@@ -65,7 +65,7 @@ class Expert(NamedTuple):
 
 
 def expert_curriculum(curriculum: Curriculum, task: TaskLike) -> Curriculum:
-    """A curriculum of one task: the frames of the block that trains it first, the same evaluation and task id.
+    """A curriculum of one task: the frames of its first block, the same evaluation and task id.
 
     Raises:
         ValueError: if that block trains other tasks, too.
@@ -98,22 +98,22 @@ def find_or_train(
     only: int | None = None,
     console: Console | None = None,
 ) -> tuple[dict[int, list[Expert]], Failures]:
-    """Return each seed's experts of all tasks of a curriculum; those that the folder lacks are trained first.
+    """Return each seed's experts of all tasks, training those that the folder lacks.
 
-    The experts of a task are trained as one batch, those of all seeds that have not begun theirs.
+    Experts of one task that have not begun are trained as one batch.
 
     Args:
         curriculum: has the tasks.
         learn: trains the experts of a task, or resumes their training.
-        folder: where experts are kept, each under a hash of its curriculum's fingerprint and the settings.
-        settings: for each seed all else that its experts' numbers depend on: agent, seed, versions.
-        tell: is given a line about each expert.
-        waiting: called every half second while another process trains one that is needed here.
-        only: the position of the one task whose experts are needed, from 1; None: all.
+        folder: of experts, each under a hash of its curriculum's fingerprint and settings.
+        settings: by seed, all else that experts' numbers depend on: agent, seed, versions.
+        tell: takes a line about each expert.
+        waiting: called every half second while another process trains one.
+        only: the one task, from 1, whose experts are needed; None: all.
         console: where progress shows; default: standard error.
 
     Returns:
-        The experts of each seed, and the error of each seed with an expert that failed, which then has none.
+        Experts by seed, and the error of each seed with a failed expert, which has none.
 
     Raises:
         ValueError: before any training, for a block with several tasks.
@@ -135,7 +135,7 @@ def find_or_train(
 
 
 def _left(run_dirs: RunDirs, what: str, tell: Callable[[str], object]) -> dict[int, Path]:
-    """Return those that are not trained, and tell of each."""
+    """Return untrained ones, and tell of each."""
     left = _untrained(run_dirs)
     for seed, run_dir in run_dirs.items():
         of_seed = f" of seed {seed}" if len(run_dirs) > 1 else ""
@@ -148,7 +148,7 @@ def _left(run_dirs: RunDirs, what: str, tell: Callable[[str], object]) -> dict[i
 def _train(
     curriculum: Curriculum, learn: Learn, run_dirs: RunDirs, waiting: Callable[[], object], console: Console | None
 ) -> Failures:
-    """Train into directories, or resume what was begun there; wait while other processes train into them."""
+    """Train or resume in directories, waiting for other processes there."""
     failed: Failures = {}
     with Session(console) as session:
         for run_dir in sorted(run_dirs.values()):  # one order, so that no two processes wait for each other
@@ -159,9 +159,9 @@ def _train(
 
 
 def _groups(curriculum: Curriculum, run_dirs: RunDirs) -> list[RunDirs]:
-    """Divide seeds into those that are trained as one batch: those that were begun so, and all that begin.
+    """Divide seeds into batches: those begun so, and all that begin.
 
-    Where a group was begun of which some are not here, the others begin again, unless they have learned all.
+    If some of a begun group are not here, the others begin again, unless they have learned all.
     """
     begun: dict[tuple[int, ...], dict[int, int]] = {}
     for seed, run_dir in run_dirs.items():
@@ -179,17 +179,17 @@ def _groups(curriculum: Curriculum, run_dirs: RunDirs) -> list[RunDirs]:
 
 
 def is_of_group(run_dir: Path) -> bool:
-    """Return whether a run was stopped that was begun in a group of seeds, and can only be resumed as one."""
+    """Return whether a run was stopped that can only be resumed with its group of seeds."""
     return bool(begun_with(run_dir)) and Checkpoints(run_dir / CHECKPOINTS).newest_frames is not None
 
 
 def begun_with(run_dir: Path) -> list[int]:
-    """Return the seeds with which a run was begun as one batch; none if it was begun as a single run, or not at all."""
+    """Return the seeds with which a run was begun as one batch, if any."""
     return list((RunLog.begun(run_dir / LOG) or {}).get("together", ()))
 
 
 def _untrained(run_dirs: RunDirs) -> dict[int, Path]:
-    """Return those that have no results, or damaged ones."""
+    """Return those without results, or with damaged ones."""
     left = {}
     for seed, run_dir in run_dirs.items():
         if not (run_dir / METRICS).exists() or damaged(run_dir):

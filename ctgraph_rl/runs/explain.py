@@ -1,4 +1,4 @@
-"""What is said to users of Hydra's and OmegaConf's errors: the cause in one message, and what was probably meant."""
+"""Messages for errors of Hydra and OmegaConf: the cause, and the likely name."""
 
 from __future__ import annotations
 
@@ -37,23 +37,23 @@ SAID = (
     (re.compile(r"Could not delete from config\. '(\S+)' does"), "~{0} removes what has no value: leave ~{0} out"),
     (re.compile(r"Multiple values for (\S+)\. To override .*'override \S+: (.*)'"), "{0} has a value: write {0}={1}"),
 )
-"""Beginnings of messages of Hydra, and what is said in their place."""
+"""Beginnings of Hydra's messages, and their replacements."""
 
 MOST_CHOICES = 20
 """Names that a message lists at most."""
 
 LAUNCHERS = {"hydra/launcher/joblib": "joblib", "hydra/launcher/submitit_slurm": "slurm"}
-"""Configurations that come with other packages, and the extras that install these."""
+"""Configurations of other packages, and their extras."""
 
 _NO_SETTINGS = {"_target_", "hydra"}
 
 
 def explain(error: BaseException, cfg: DictConfig | None = None) -> str:
-    """Return one message for a user's error: its cause within Hydra's errors, and what was probably meant.
+    """Return one message for a user's error: its cause within Hydra's errors, and the likely name.
 
     Args:
         error: what was raised.
-        cfg: the configuration of the run that raised it; None: there was none yet.
+        cfg: the run's configuration, if there was one.
     """
     cause = error
     while cause.__cause__ is not None and not _says_what_to_do(cause):
@@ -78,7 +78,7 @@ def explain(error: BaseException, cfg: DictConfig | None = None) -> str:
 
 
 def _first(error: OmegaConfBaseException) -> OmegaConfBaseException:
-    """Return the error that others of OmegaConf were made of, such as one of a setting that a name is made of."""
+    """Return OmegaConf's first error, which others were made of."""
     first = error
     each: BaseException | None = error
     while isinstance(each, OmegaConfBaseException):
@@ -88,11 +88,11 @@ def _first(error: OmegaConfBaseException) -> OmegaConfBaseException:
 
 
 def _of_omegaconf(error: OmegaConfBaseException, message: str) -> str:
-    """Return what is wrong with a setting: its name, its value as it was typed, why, and what to do.
+    """Return a setting's fault: its name, its value as typed, why, and what to do.
 
     Args:
-        error: what is said of it.
-        message: what is said where the error does not tell of a setting.
+        error: by OmegaConf.
+        message: for errors that name no setting.
     """
     key = str(error.full_key or "")
     if not isinstance(error.parent_node, DictConfig) or not key:
@@ -109,7 +109,7 @@ def _of_omegaconf(error: OmegaConfBaseException, message: str) -> str:
 
 
 def _unresolved_choice(raw: str) -> str:
-    """Return why the choice of a group's file has no value; Hydra does not say of which group."""
+    """Return why a group's choice has no value."""
     setting = next((word for word in sys.argv if word.endswith(f"={raw}")), raw)
     try:
         OmegaConf.to_container(OmegaConf.create({"choice": raw}), resolve=True)
@@ -119,7 +119,7 @@ def _unresolved_choice(raw: str) -> str:
 
 
 def _why_unresolved(message: str, raw: str) -> str:
-    """Return why OmegaConf finds no value for a text, and what to do."""
+    """Return why OmegaConf finds no value, and what to do."""
     why = message.partition("\n")[0].rpartition("raised while resolving interpolation: ")[2].strip('"')
     why = why.replace("Unsupported interpolation type", "there is no resolver")
     if "nvironment variable" in why:
@@ -128,7 +128,7 @@ def _why_unresolved(message: str, raw: str) -> str:
 
 
 def _unknown_file(group: str, name: str, choices: Sequence[str]) -> str:
-    """Return why a group of the configuration has no file of a name."""
+    """Return why a group has no such file."""
     extra = LAUNCHERS.get(f"{group}/{name}")
     if extra is not None:
         return f"this launcher is another package: pip install 'ctgraph_rl[{extra}]'"
@@ -138,7 +138,7 @@ def _unknown_file(group: str, name: str, choices: Sequence[str]) -> str:
 
 
 def _unknown_setting(asked: str, node: DictConfig) -> str:
-    """Return why a setting is none, and what was probably meant: a key beside it or, of the whole run, any below."""
+    """Return why a setting is unknown, and the likely one: beside it or, of the whole run, anywhere below."""
     group, _, key = asked.rpartition(".")
     if group == "hydra.runtime.choices" and len(node):
         return _removed(key)
@@ -158,14 +158,14 @@ def _removed(key: str) -> str:
 
 
 def _says_what_to_do(error: BaseException) -> bool:
-    """Return whether an error says more than what caused it."""
+    """Return whether an error says more than its cause."""
     if isinstance(error, OmegaConfBaseException):
         return False
     return isinstance(error, (ValueError, OSError, ModuleNotFoundError))
 
 
 def _unresolved(cfg: DictConfig) -> NamedValues:
-    """Return a configuration without Hydra's own as plain values, with unresolved interpolations."""
+    """Return a configuration, without Hydra's part, as plain values with unresolved interpolations."""
     values: NamedValues = OmegaConf.to_container(cfg, resolve=False)  # type: ignore[assignment]
     values.pop("hydra", None)
     return values

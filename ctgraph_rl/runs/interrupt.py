@@ -1,4 +1,4 @@
-"""Signals that ask a run to stop: it saves within one update, then exits; a second one stops it at once."""
+"""Signals that ask a run to stop: it saves within one update and exits; a second one stops it at once."""
 
 from __future__ import annotations
 
@@ -14,15 +14,14 @@ from types import FrameType
 from typing import Any
 
 STOPPING = ("SIGINT", "SIGTERM", "SIGUSR2")
-"""SIGUSR2 only where something handles it, such as submitit before the time limit of a SLURM job."""
+"""SIGUSR2 only if something handles it, such as submitit before a SLURM job's time limit."""
 
 
 class Interrupt:
     """While this context is entered, a signal to stop is kept for `exit` instead of acting at once.
 
-    Where another library handles SIGUSR2 to put the job into the queue again (submitit), it does so after the save.
-    Signals that are ignored, as in the background of a script, stay so. Outside the main thread, where Python allows no
-    handlers, signals act as before.
+    A library that handles SIGUSR2 to queue the job again (submitit) does so after the save. Ignored signals, as in a
+    script's background, stay ignored. Outside the main thread signals act as before.
     """
 
     def __init__(self) -> None:
@@ -50,16 +49,16 @@ class Interrupt:
             self.check()
 
     def check(self) -> None:
-        """Leave the process if it was asked to stop."""
+        """Exit if the process was asked to stop."""
         if self.is_asked:
             self.exit()
 
     def exit(self) -> None:
-        """Leave the process with the code of the signal, or let the scheduler's library put it into the queue again.
+        """Exit with the signal's code, or let the scheduler's library queue the job again.
 
         Raises:
             SystemExit: always, but for the next.
-            RuntimeError: if the job should be in the queue again and is not.
+            RuntimeError: if the job could not be queued again.
         """
         assert self.signal is not None
         print("saved; the same command resumes from there", file=sys.stderr)
@@ -72,7 +71,7 @@ class Interrupt:
         raise SystemExit(128 + self.signal)
 
     def _ask(self, number: int, frame: FrameType | None) -> None:
-        """Remember the first signal; the next acts as it did before."""
+        """Remember the first signal; the next acts as before."""
         self.signal = number
         self._restore()
         print(f"\n{signal.Signals(number).name}: saving after this update ... ", end="", file=sys.stderr, flush=True)
@@ -85,7 +84,7 @@ class Interrupt:
 
 @contextmanager
 def _deaf() -> Iterator[None]:
-    """Ignore signals to stop, also in the processes that are started: SLURM sends them to all processes of a job."""
+    """Ignore signals to stop, also in started processes, as SLURM sends them to all."""
     before = {}
     for name in STOPPING:
         number = getattr(signal, name, 0)
@@ -103,7 +102,7 @@ def _put_into_queue(requeue: Callable[[int, FrameType | None], object]) -> None:
     """Call submitit's handler, which leaves the process.
 
     Raises:
-        RuntimeError: if that failed and SLURM does not have the job in its queue.
+        RuntimeError: if that failed and the job is not in SLURM's queue.
     """
     try:
         requeue(_requeuing(), None)
@@ -115,19 +114,19 @@ def _put_into_queue(requeue: Callable[[int, FrameType | None], object]) -> None:
 
 
 def _is_being_ended() -> bool:
-    """Return whether SLURM already ends this process's job: for good, as by ``scancel``, which a requeue would undo."""
+    """Return whether SLURM ends this job for good, as by ``scancel``, which a requeue would undo."""
     shown = _shown_job()
     return "JobState=COMPLETING" in shown or "JobState=CANCELLED" in shown
 
 
 def _is_in_queue() -> bool:
-    """Return whether SLURM has the job in its queue: it counts a restart at once, while it ends this one."""
+    """Return whether SLURM has queued the job: it counts a restart at once, while it ends this one."""
     restarts = re.search(r"Restarts=(\d+)", _shown_job())
     return restarts is not None and int(restarts[1]) > int(os.environ.get("SLURM_RESTART_COUNT") or 0)
 
 
 def _shown_job() -> str:
-    """Return what SLURM tells of this process's job; nothing where it does not answer."""
+    """Return SLURM's facts on this job, or nothing."""
     command = ["scontrol", "show", "job", _job()]
     try:
         return subprocess.run(command, capture_output=True, text=True, timeout=10).stdout
@@ -136,11 +135,11 @@ def _shown_job() -> str:
 
 
 def _job() -> str:
-    """Return SLURM's name for the job of this process; in an array one task's number would name all its tasks."""
+    """Return SLURM's name for this job; an array task's number would name all its tasks."""
     names = [os.environ.get(name, "") for name in ("SLURM_ARRAY_JOB_ID", "SLURM_ARRAY_TASK_ID")]
     return "_".join(names) if all(names) else os.environ.get("SLURM_JOB_ID", "")
 
 
 def _requeuing() -> int:
-    """Return the signal by which submitit's jobs are put into the queue again; 0 where there is none."""
+    """Return the signal by which submitit queues jobs again, or 0."""
     return getattr(signal, "SIGUSR2", 0)

@@ -52,18 +52,18 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import changed
 
 OF_AN_EXPERT = ("agent", "seed", "device", "num_threads", "portable")
-"""Settings that a single-task expert shares with the run that needs it."""
+"""Settings that an expert shares with its run."""
 
 
 ConfigAndPath = tuple[Any, Path]
-"""A composed configuration, and the existing directory of its run."""
+"""A composed configuration, and its run's existing directory."""
 
 
 def build(cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None = None) -> RunMember:
     """Build the objects of a configuration, the agent last, which decides the state of torch's global generator.
 
     Raises:
-        ValueError: for values out of range, and parts that do not go together.
+        ValueError: for values out of range, and parts that do not fit.
     """
     checked_device(cfg.device)
     prepare_torch(cfg)
@@ -85,7 +85,7 @@ def make_member(
     settings: ReadOnlyValues,
     interrupt: Interrupt | None,
 ) -> RunMember:
-    """Build the agent of a run, or of its expert, and give it a directory; ``settings`` are what its log holds."""
+    """Build the agent of a run or expert, with a directory; its log holds ``settings``."""
     agent = new_agent(curriculum, make_agent, cfg.seed, cfg.device)
     return RunMember(
         curriculum,
@@ -104,12 +104,12 @@ def checkpoints_of(cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None) 
 
 
 def console_of_runs() -> Console | None:
-    """Return where progress shows: a sweep shows none of its runs."""
+    """Return where progress shows; a sweep shows none of its runs."""
     return Console(quiet=True) if config.in_sweep() else None
 
 
 def prepare(session: Session, cfg: DictConfig, member: RunMember) -> None:
-    """Open the tracker of a run, remove results that are replaced, and write the configuration."""
+    """Open a run's tracker, remove replaced results, and write the configuration."""
     run_dir = member.run_dir
     replaced = bool(cfg.overwrite)
     if cfg.overwrite == config.STALE:
@@ -127,14 +127,14 @@ def prepare(session: Session, cfg: DictConfig, member: RunMember) -> None:
 
 
 def settings_of_experts(cfg: DictConfig) -> NamedValues:
-    """Return the settings that a run shares with its single-task experts."""
+    """Return the settings that experts share with their run."""
     return {key: value for key, value in config.plain(cfg).items() if key in OF_AN_EXPERT}
 
 
 def train_experts(
     configs: Sequence[Any], curriculum: Curriculum, interrupt: Interrupt, only: int | None = None
 ) -> tuple[dict[int, list[Expert]], Failures]:
-    """Find or train the single-task experts of the runs of several seeds, those of a task as one batch.
+    """Find or train the single-task experts of several seeds' runs, those of a task as one batch.
 
     Args:
         configs: of each seed.
@@ -206,24 +206,24 @@ def make_agent(
     """Build an agent for a curriculum from the yaml files that the command line reads, with the same weights.
 
     ``log = learn_curriculum(curriculum, agent, seed)`` then gives the measurements of ``ctgraph-rl agent=NAME``, with
-    the same bits, and ``scores(log, curriculum)`` its metrics. As a run does, this seeds torch's global generator, sets
-    the number of torch's threads to ``num_threads`` of ``conf/config.yaml``, and flushes denormal numbers to zero.
+    the same bits, and ``scores(log, curriculum)`` its metrics. Like a run it seeds torch's global generator, sets
+    torch's threads to ``num_threads`` of ``conf/config.yaml``, and flushes denormal numbers to zero.
 
     Args:
         name: of a file in ``conf/agent``, such as ``"ppo"``.
         curriculum: what the agent will learn.
         seed: decides the weights and torch's global generator, in [0, 2**63); None: as on the command line.
-        method: name of a file in ``conf/method``, such as ``"ewc"``; None: as on the command line.
-        method_settings: values that replace those of the method's file, such as ``{"coeff": 50.0}``.
-        detector: name of a file in ``conf/detector``, such as ``"swoks"``; None: without.
-        cell: name of a file in ``conf/cell``, such as ``"gru"``; None: as on the command line.
+        method: of a file in ``conf/method``, such as ``"ewc"``; None: as on the command line.
+        method_settings: replace those of the method's file, such as ``{"coeff": 50.0}``.
+        detector: of a file in ``conf/detector``, such as ``"swoks"``; None: without.
+        cell: of a file in ``conf/cell``, such as ``"gru"``; None: as on the command line.
         device: where the agent lives; None: as on the command line.
         config_dir: a directory with the user's ``agent/NAME.yaml``, ``method/NAME.yaml`` and ``cell/NAME.yaml``.
-        settings: values that replace those of the agent's file, such as ``learning_rate=0.001``.
+        settings: replace those of the agent's file, such as ``learning_rate=0.001``.
 
     Raises:
-        ValueError: for unknown names and settings, with the one that was probably meant; for values out of range, an
-            agent that cannot learn the curriculum, and a method that learns another curriculum in its place.
+        ValueError: for unknown names and settings, with the likely one; for values out of range, an agent that cannot
+            learn the curriculum, and a method that learns another in its place.
 
     Example:
         >>> import curricula
@@ -251,7 +251,7 @@ def make_agent(
 
 
 def method_of(cfg: DictConfig) -> Callable[[], MethodLike]:
-    """Return what builds the method of a configuration, labelled by its detector if it has one."""
+    """Return what builds a configuration's method, labelled by its detector if it has one."""
     make_method = config.target(cfg, "method")
     if "detector" not in cfg:
         return make_method
@@ -260,7 +260,7 @@ def method_of(cfg: DictConfig) -> Callable[[], MethodLike]:
 
 
 def prepare_torch(cfg: DictConfig) -> None:
-    """Set how torch computes, which a run's bits depend on."""
+    """Set how torch computes, which decides a run's bits."""
     if cfg.portable:
         hold()
     torch.set_num_threads(cfg.num_threads)
@@ -268,13 +268,13 @@ def prepare_torch(cfg: DictConfig) -> None:
 
 
 def run_job(cfg: DictConfig, run_dir: Path, built: RunMember | None = None) -> None:
-    """Run a configuration in an existing directory, unless its results are there; a read-only one may hold them.
+    """Run a configuration in an existing directory, unless it, even read-only, holds the results.
 
     ``built`` are its objects, if they were just built.
 
     Raises:
         ValueError: before any work, for a value out of range.
-        FileExistsError: if the directory holds results that ``overwrite`` does not allow to replace.
+        FileExistsError: for results that ``overwrite`` does not replace.
         FloatingPointError: if a loss or weight is not finite.
     """
     logging.getLogger("torchrl").setLevel(logging.WARNING)
@@ -302,13 +302,13 @@ def learn(
     built: RunMember | None = None,
     together: bool = False,
 ) -> Failures:
-    """Build the objects of runs that differ in their seeds, and let them learn into their locked directories.
+    """Build runs that differ in their seeds, and let them learn in their locked directories.
 
     Args:
         session: has the locks.
-        cells: one, or all that learn as one batch.
+        cells: one, or all of a batch.
         interrupt: for checkpoints.
-        built: the objects of one of them, if they were just built.
+        built: the objects of one, if built.
         together: learn as one batch, of one seed, too.
 
     Returns:
@@ -345,7 +345,7 @@ def learn(
 
 
 def run_as_one(cells: Sequence[ConfigAndPath], built: RunMember | None = None) -> None:
-    """Run those that are not finished, as one batch; a seed that fails stops no other.
+    """Run unfinished ones as one batch; a failed seed stops no other.
 
     ``built`` are the objects of one, if they were just built.
 
@@ -413,11 +413,10 @@ def run_seeds(cfg: Any, run_dir: Path) -> list[Path]:
 
 
 def is_finished(cfg: DictConfig, run_dir: Path) -> bool:
-    """Return whether the directory already holds the results of this configuration, complete.
+    """Return whether the directory holds the complete results of this configuration.
 
     Raises:
-        FileExistsError: if it holds a run, finished or not, of another configuration or of code that has changed;
-            shows the difference.
+        FileExistsError: for a run, finished or not, of another configuration or of changed code; shows the difference.
     """
     about = None if cfg.overwrite is True else first_line(run_dir)
     if about is None:
@@ -438,7 +437,7 @@ def is_finished(cfg: DictConfig, run_dir: Path) -> bool:
 
 
 def changed_code(cfg: DictConfig, run_dir: Path, known: dict[str, NamedValues]) -> tuple[list[str], bool]:
-    """Return in words what code has changed since a configuration was run in a directory, and whether some is unknown.
+    """Return in words the code that changed since a run in a directory, and whether some is unknown.
 
     Nothing has for a run that was stopped before its first checkpoint. ``known`` keeps the code of configurations.
     """
@@ -450,7 +449,7 @@ def changed_code(cfg: DictConfig, run_dir: Path, known: dict[str, NamedValues]) 
 
 
 def code_of(cfg: DictConfig, known: dict[str, NamedValues]) -> NamedValues:
-    """Return what a run of a configuration would store of its code; see `ctgraph_rl.log.provenance.code`."""
+    """Return `ctgraph_rl.log.provenance.code` of a configuration's run."""
     settings = config.plain(cfg)
     deciding = {key: settings.get(key) for key in ("curriculum", "method", "detector", *config.PARTS)}
     key = json.dumps([deciding, learners(settings, None)], sort_keys=True)
@@ -462,10 +461,10 @@ def code_of(cfg: DictConfig, known: dict[str, NamedValues]) -> NamedValues:
 
 
 def first_line(run_dir: Path) -> ReadOnlyValues | None:
-    """Return the first line of the log of the run that a directory holds; None without a run.
+    """Return the first line of a run's log; None without a run.
 
     Raises:
-        FileExistsError: if it holds files that a run would replace, and that are of no run.
+        FileExistsError: if a run would replace files that are of no run.
     """
     begun = RunLog.begun(run_dir / LOG)
     if begun is not None:
@@ -481,7 +480,7 @@ def first_line(run_dir: Path) -> ReadOnlyValues | None:
 
 
 def curriculum_of(cfg: DictConfig, method: MethodLike) -> Curriculum:
-    """Return what a configuration lets an agent with a method learn.
+    """Return what an agent with a method learns.
 
     Raises:
         ValueError: for values out of range.
@@ -490,7 +489,7 @@ def curriculum_of(cfg: DictConfig, method: MethodLike) -> Curriculum:
 
 
 def with_changes(curriculum: Curriculum, cfg: DictConfig) -> Curriculum:
-    """Return the curriculum with what ``evaluation`` and ``protocol`` of the configuration change.
+    """Return the curriculum with the configuration's changes of ``evaluation`` and ``protocol``.
 
     Raises:
         ValueError: for values out of range.

@@ -1,4 +1,4 @@
-"""A run's trained agent, given back from its directory; no code of the directory is ever run."""
+"""A run's trained agent, from its directory; no code of the directory is run."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ OURS = {
     "cell": re.compile(r"(baselines\.cells\.\w+)\.(\w+)"),
     "detector": re.compile(r"(baselines\.detectors\.\w+)\.(\w+)"),
 }
-"""Names of agents, methods, cells and detectors that a directory may name; the caller of `load` gives any other."""
+"""Agents, methods, cells and detectors that a directory may name."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,7 @@ class Trained:
     """The agent that a run trained, and what it learned.
 
     ``evaluate(trained.policy_for(task), [task], initial_state=trained.agent.initial_state,
-    curriculum=trained.curriculum)`` of this package plays a task, ``learn_curriculum(another, trained.agent)`` lets the
-    agent learn on.
+    curriculum=trained.curriculum)`` plays a task, ``learn_curriculum(another, trained.agent)`` learns on.
     """
 
     agent: Agent
@@ -54,9 +53,9 @@ class Trained:
     log: RunLog
 
     def policy_for(self, task: TaskLike) -> TensorDictModuleBase:
-        """Return the policy for a task: the one for its id, where the curriculum has one and shows it.
+        """Return the policy for a task: by its id, where the curriculum has and shows one.
 
-        For an agent that labels tasks itself, it is that of the task's most frequent label.
+        For an agent that labels tasks itself, by the task's most frequent label.
         """
         return task_policies(self.agent, self.curriculum, self.log, [task])[0]
 
@@ -68,22 +67,18 @@ def load(
     device: torch.device | str = "cpu",
     make_method: Callable[[], MethodLike] | None = None,
 ) -> Trained:
-    """Load the trained agent of a run, finished or not, with its method and all that it needs to play or to learn on.
+    """Load the trained agent of a run, finished or not, with its method, to play or learn on.
 
     Args:
-        run_dir: the directory.
-        make_agent: needed where the agent's class is none of the baselines: the class, which is built with the
-            settings that the run stored, or a function of the environment's unbatched observation and action specs,
-            such as ``partial(MyAgent, **settings)``.
-        curriculum: what was learned; needed where it has parts of classes that are not this package's.
-        device: where the agent shall live.
-        make_method: builds the agent's method; needed where its class is not one of the baselines': the class or a
-            function, in the same way. Where the detector's class is none of the baselines, it builds both, such as
+        make_agent: for a class outside ``baselines``: the class, built with the stored settings, or a function of the
+            environment's unbatched observation and action specs, such as ``partial(MyAgent, **settings)``.
+        curriculum: for one with parts of other classes than this package's.
+        make_method: for a method outside ``baselines``, likewise. With such a detector it builds both, such as
             ``lambda: MyDetector(...).labelling(MaskRI())``.
 
     Raises:
-        FileNotFoundError: if there is no run, or none that has been saved.
-        ValueError: for an agent, a method or a curriculum that must be given, and files that do not belong together.
+        FileNotFoundError: without a saved run.
+        ValueError: for a missing agent, method or curriculum, and files that do not belong together.
     """
     run_dir = as_path("run_dir", run_dir)
     device = checked_device(device)
@@ -108,7 +103,7 @@ def load(
 
 
 def _curriculum(run_dir: Path, given: Curriculum | None, fingerprint: Any) -> Curriculum:
-    """Return the run's curriculum, from its directory if it is not given."""
+    """Return the given curriculum, or the directory's."""
     path = run_dir / CURRICULUM
     there = given is not None or path.exists()
     require((there, f"{run_dir} has no {CURRICULUM}, as of classes that are not ours: give load(..., curriculum=)"))
@@ -125,7 +120,7 @@ def _builder(
     make_method: Callable[[], MethodLike] | None,
     curriculum: Curriculum,
 ) -> MakeAgent:
-    """Return what builds the agent with its method, if it has one; the curriculum is already prepared for that."""
+    """Return what builds the agent with its method; the curriculum is prepared for it."""
     stored = {part: config.get(part) for part in OURS}
     named = make_agent is None
     alone = _ours(run_dir, "agent", stored["agent"]) if named else _with(run_dir, make_agent, stored["agent"])
@@ -139,7 +134,7 @@ def _builder(
 
 
 def _labelled(run_dir: Path, make_method: Callable[[], MethodLike], detector: Any) -> MethodLike:
-    """Return a new method, labelled by the detector that a run stored, if there is one and it is not labelled yet."""
+    """Return a new method, labelled by the stored detector unless it is already."""
     method = make_method()
     if detector is None or hasattr(method, "detector"):
         return method
@@ -148,7 +143,7 @@ def _labelled(run_dir: Path, make_method: Callable[[], MethodLike], detector: An
 
 
 def _with(run_dir: Path, make: Any, stored: Any) -> Callable[..., Any]:
-    """Return a class with the settings that a run stored, as far as it takes them; another function unchanged."""
+    """Return a class with the stored settings that it takes; another function unchanged."""
     if not (isinstance(make, type) and isinstance(stored, Mapping)):
         return make
     takes = parameters_of(make)
@@ -158,7 +153,7 @@ def _with(run_dir: Path, make: Any, stored: Any) -> Callable[..., Any]:
 
 
 def _ours(run_dir: Path, part: str, settings: Any) -> Callable[..., Any]:
-    """Return what builds a part that a configuration names, such as its agent, if its class is one of ``baselines``."""
+    """Return what builds a configuration's part, such as its agent, if its class is one of ``baselines``."""
     settings = settings if isinstance(settings, Mapping) else {}
     name = str(settings.get("_target_"))
     ours = OURS[part].fullmatch(name)
@@ -173,14 +168,14 @@ def _ours(run_dir: Path, part: str, settings: Any) -> Callable[..., Any]:
 
 
 def _settings(run_dir: Path, stored: ReadOnlyValues) -> NamedValues:
-    """Return the settings of a class, with what builds its cell in place of the cell's settings."""
+    """Return a class's settings, with the cell's builder in place of its settings."""
     given = {key: value for key, value in stored.items() if key not in ("_target_", "_partial_")}
     has_cell = isinstance(given.get("cell"), Mapping)
     return given | ({"cell": _ours(run_dir, "cell", given["cell"])} if has_cell else {})
 
 
 def _weights(run_dir: Path, log: RunLog) -> tuple[ReadOnlyValues, int]:
-    """Return the agent's state at the end of the run, or at its last checkpoint, and the frames by then."""
+    """Return the agent's state at the end, or at the last checkpoint, and its frames."""
     if (run_dir / AGENT).exists():
         return _checked(run_dir / AGENT), log.ends()[-1]
     saved = Checkpoints(run_dir / CHECKPOINTS).newest()
@@ -191,7 +186,7 @@ def _weights(run_dir: Path, log: RunLog) -> tuple[ReadOnlyValues, int]:
 
 
 def _checked(path: Path) -> Any:
-    """Return what a file of `torch.save` holds, if its own sums agree and it is plain."""
+    """Return the content of a file of `torch.save`, if its sums agree and it is plain."""
     try:
         content = read_content(path)
         require_records(content)

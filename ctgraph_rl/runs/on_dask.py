@@ -1,4 +1,4 @@
-"""A cell of a sweep as a task of a Dask cluster: it runs in a process that ends with it."""
+"""A cell of a sweep as a task of a Dask cluster, in a process that ends with it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from omegaconf import DictConfig, open_dict
 
 @dataclass(frozen=True)
 class DaskCell:
-    """What Hydra needs to run one cell in another process.
+    """Hydra's parts to run a cell in another process.
 
     Args:
         hydra_context: composes the cell's configuration.
@@ -37,11 +37,11 @@ class DaskCell:
     number: int
 
     def pack(self) -> tuple[str, list[str], bytes]:
-        """Return the working directory, the places of modules, and the cell as bytes."""
+        """Return the working directory, modules' places, and the cell as bytes."""
         return os.getcwd(), sys.path, pickle.dumps(self)
 
     def run(self) -> JobReturn:
-        """Run the cell as Hydra's own launchers do."""
+        """Run the cell as Hydra's launchers do."""
         setup_globals()
         Plugins.instance()  # registers the files of other launchers and sweepers
         config = self.hydra_context.config_loader.load_sweep_config(self.config, self.overrides)
@@ -59,16 +59,16 @@ class DaskCell:
 
 
 def run_cell(packed: tuple[str, list[str], bytes], wait: float) -> JobReturn:
-    """Run a cell in a process; while another process runs it, wait and try again.
+    """Run a cell in a process, waiting while another process runs it.
 
-    That other process may be the child of a worker or of a driver that was killed.
+    That may be the child of a killed worker or driver.
 
     Args:
-        packed: of `DaskCell.pack`.
+        packed: by `DaskCell.pack`.
         wait: seconds between two tries.
 
     Raises:
-        RuntimeError: if the process ended without a result, as a killed one does; Dask then starts the cell again.
+        RuntimeError: if the process ended without a result, so that Dask starts the cell again.
     """
     folder, places, cell = packed
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(places)}

@@ -1,7 +1,7 @@
-"""Run directories as data: each log is read once, and only what tables and figures need is kept of it.
+"""Run directories as data: each log is read once, and only what tables and figures need is kept.
 
-Runs of one configuration but for the seed belong together. Those in one folder that name no agent are one learner with
-the name of the folder. A directory that cannot be read is a `Problem` with its reason, and never a number.
+Runs that differ only in their seed belong together. Those in one folder that name no agent are one learner with the
+folder's name. An unreadable directory is a `Problem` with its reason, never a number.
 """
 
 from __future__ import annotations
@@ -32,42 +32,42 @@ from ctgraph_rl.runs.status import failure
 from ctgraph_rl.strict import files_below, one_line_of, too_deep
 
 MODIFIED = " (modified)"
-"""Ending of the name of a curriculum that differs from the published one of this name."""
+"""Ending of the name of a curriculum that differs from the published one."""
 
 OF_THE_CURRICULUM = ("curriculum", "evaluation", "protocol")
-"""Settings that a curriculum's fingerprint covers."""
+"""Settings within the fingerprint."""
 
 ABOUT = ("curriculum", "fingerprint", "config")
-"""Keys that the first line of a log must have."""
+"""Keys of a log's first line."""
 
 NO_METHOD = "Finetune"
-"""The method that changes nothing: a run with it and one without a method have the same configuration."""
+"""The method that changes nothing, as none."""
 
 FOLDER = "folder"
-"""Setting of a run that names no agent: all of these in one folder are one learner."""
+"""Setting of runs that name no agent: those in one folder are one learner."""
 
 MEASURES = {
     "evaluation": ("", ("return_mean", "success_rate")),
     "adaptation": ("adaptation_", ("return_mean", "success_rate", "found_rate", "exact_rate")),
     "training": ("training_", ("return_mean", "success_rate")),
 }
-"""For each kind of measurement, how its values' names begin, and the fields that are values."""
+"""By kind of measurement: the beginning of values' names, and the fields."""
 
 MOST_MODULES = 3
-"""Modules that differ between runs that else are alike and are named; one digest stands for all others."""
+"""Differing modules that are named; one digest stands for the others."""
 
 CurriculumKey = tuple[str, str]
-"""A curriculum by its name and its fingerprint."""
+"""A curriculum's name and fingerprint."""
 
 AgentKey = tuple[str, str]
-"""An agent on a curriculum, by the names that tables show."""
+"""Curriculum and agent, as tables name them."""
 
 Curve = list[tuple[int, float]]
-"""Mean returns after numbers of frames; NaN for one without a value."""
+"""Mean returns by frames, or NaN."""
 
 
 class Value(NamedTuple):
-    """A number that a run measured; a field that says nothing about it is None."""
+    """A number that a run measured; fields that do not apply are None."""
 
     task: str | None  # label of an evaluated task
     held_out: bool | None  # whether no block trains the task
@@ -80,11 +80,11 @@ class Value(NamedTuple):
 
 
 NOWHERE = (None,) * 6
-"""Where a number of the whole run was measured."""
+"""Place of a whole run's numbers."""
 
 
 class History(NamedTuple):
-    """The measurements of a run, of the curriculum's own tasks."""
+    """A run's measurements of the curriculum's own tasks."""
 
     labels: tuple[str, ...]  # name of each task
     trained: tuple[tuple[int, ...], ...]  # for each block the positions of its tasks; empty if the log does not say
@@ -99,7 +99,7 @@ class History(NamedTuple):
 
 
 def split_by(items: Iterable[Any], key: Callable[[Any], Any]) -> dict[Any, list[Any]]:
-    """Return the items of each key, in their order."""
+    """Return items by key, in their order."""
     found: dict[Any, list[Any]] = {}
     for item in items:
         found.setdefault(key(item), []).append(item)
@@ -113,15 +113,14 @@ class Run:
     Args:
         path: the directory.
         about: the first line of its log.
-        agent: class or name of the learner, ``PPO + EWC`` with a method; None if the configuration does not say.
-        settings: the configuration without the seed and what the fingerprint covers, by dotted keys; with the folder
-            of the directory if there is no agent.
+        agent: class or name of the learner, ``PPO + EWC`` with a method, if known.
+        settings: the configuration without seed and fingerprint, by dotted keys; with the folder if there is no agent.
         seed: the seed.
         reason: why it has no results; None for a finished run.
         metrics: `Metric` fields by name; empty without results.
-        values: everything that tables show of it; empty if the log cannot be read.
-        history: curves and performance; None if the log cannot be read.
-        shown: place and name that tables and figures give its agent; None: as `grouped` finds them.
+        values: everything that tables show; empty for an unreadable log.
+        history: curves and performance; None for an unreadable log.
+        shown: its agent's place and name in tables and figures; None: by `grouped`.
     """
 
     path: Path
@@ -137,17 +136,17 @@ class Run:
 
     @cached_property
     def success(self) -> Mapping[str, float | None]:
-        """Success rate on each task by its label, at the end; empty without results."""
+        """Final success rate by task label; empty without results."""
         return self._at_end("success_rate")
 
     @cached_property
     def returns(self) -> Mapping[str, float | None]:
-        """Mean return on each task by its label, at the end; empty without results."""
+        """Final mean return by task label; empty without results."""
         return self._at_end("return_mean")
 
     @cached_property
     def tasks(self) -> Sequence[str]:
-        """Labels of the tasks that are not held out; empty without results."""
+        """Labels of tasks not held out; empty without results."""
         evaluated = dict.fromkeys(each.task for each in self.values if each.held_out is False)
         return [task for task in self.returns if task in evaluated]
 
@@ -164,18 +163,18 @@ class Run:
 
     @property
     def curriculum(self) -> CurriculumKey:
-        """The curriculum by its name and its fingerprint."""
+        """The curriculum's name and fingerprint."""
         return self.about["curriculum"], self.about["fingerprint"]
 
     @property
     def group(self) -> CurriculumKey:
-        """The curriculum by its published name and its fingerprint."""
+        """The curriculum's published name and fingerprint."""
         name, fingerprint = self.curriculum
         return name.removesuffix(MODIFIED), fingerprint
 
     @property
     def code(self) -> NamedValues:
-        """The numbers version of the package, and the digest of each module of the user; None where it is not known."""
+        """The numbers version, and the digest of each user module, if known."""
         found = {"numbers version": self.about.get("numbers", 1)}
         sources = self.about.get("sources")
         if sources is not None:
@@ -197,34 +196,34 @@ class Run:
 
 
 class Problem(NamedTuple):
-    """A directory that is left out."""
+    """A directory left out."""
 
     path: Path
     reason: str
 
 
 def why_left_out(problems: Iterable[Problem]) -> str:
-    """Return why directories are left out, in one text."""
+    """Return why directories are left out."""
     return "; ".join(problem.reason for problem in problems)
 
 
 BySeed = Mapping[int, Run | None]
-"""Runs that differ only in their seed; None for a seed that only other agents have."""
+"""Runs by seed; None if only other agents have it."""
 
 
 def present(by_seed: BySeed) -> list[Run]:
-    """Return the runs that there are, by seed."""
+    """Return the existing runs."""
     return list(filter(None, by_seed.values()))
 
 
 def find_runs(paths: Iterable[Path | str], count: Count = silent) -> tuple[list[Run], list[Problem]]:
-    """Every run in or below the directories, and what is left out: unreadable logs, and one run that is there twice.
+    """Return every run in or below directories, and what is left out: unreadable logs, and duplicate runs.
 
-    Single-task experts are left out without a word where there are other runs.
+    Single-task experts are silently left out beside other runs.
 
     Args:
         paths: directories.
-        count: is called after each file that is read.
+        count: called after each file that is read.
     """
     found: list[Run] = []
     problems: list[Problem] = []
@@ -263,10 +262,10 @@ def find_runs(paths: Iterable[Path | str], count: Count = silent) -> tuple[list[
 
 
 def read_run(path: Path) -> Run:
-    """A run directory, finished or not. Of one with a broken file only what was run is known, and the reason.
+    """A run directory, finished or not. With a broken file it has only what was run, and the reason.
 
     Raises:
-        ValueError: if its log does not start with what was run, or is of a newer version.
+        ValueError: if its log lacks its first line, or is of a newer version.
         OSError: if its log cannot be opened.
     """
     file = path / LOG
@@ -328,7 +327,7 @@ def _about(file: Path) -> NamedValues:
 
 
 def _agent(config: ReadOnlyValues) -> str | None:
-    """Return agent, cell if not the usual one, method and detector, by their classes or the recorder's names."""
+    """Return agent, unusual cell, method and detector, by classes or the recorder's names."""
     learner = config.get("agent")
     agent = called(learner) or called(config.get("learner"))
     cell = called(learner.get("cell")) if isinstance(learner, Mapping) else None
@@ -337,7 +336,7 @@ def _agent(config: ReadOnlyValues) -> str | None:
 
 
 def called(part: Any) -> str | None:
-    """Return the class that a part of a configuration builds, or the part itself if it is a name."""
+    """Return the class that a configuration's part builds, or its name."""
     if isinstance(part, Mapping) and "_target_" in part:
         return str(part["_target_"]).rpartition(".")[2]
     return part if isinstance(part, str) and part else None
@@ -398,8 +397,8 @@ def _history(log: RunLog, values: Sequence[Value]) -> History:
 def grouped(runs: Sequence[Run]) -> dict[AgentKey, dict[int, Run | None]]:
     """Return runs by seed, for each (curriculum, agent); None for a seed that only other agents have.
 
-    Runs of one curriculum and agent stand where the first of them is, by the settings in which they differ. A
-    curriculum has its shortest name, with its fingerprint where another one has the same name.
+    Runs of a curriculum and agent stand at the first's place, by the settings in which they differ. A curriculum has
+    its shortest name, with its fingerprint if another has the same.
     """
     groups: dict[tuple[Any, ...], dict[int, Run]] = {}
     expected: dict[CurriculumKey, set[int]] = {}
@@ -426,7 +425,7 @@ def grouped(runs: Sequence[Run]) -> dict[AgentKey, dict[int, Run | None]]:
 
 
 def by_curriculum(runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """Return runs by the name of their curriculum in tables, in the order of tables."""
+    """Return runs by curriculum name, in the order of tables."""
     found: dict[str, list[Run]] = {}
     for (name, _), by_seed in grouped(runs).items():
         found.setdefault(name, []).extend(present(by_seed))
@@ -434,22 +433,22 @@ def by_curriculum(runs: Sequence[Run]) -> dict[str, list[Run]]:
 
 
 def histories(runs: Iterable[Run]) -> list[History]:
-    """Return the histories of the runs whose logs can be read."""
+    """Return the histories of readable runs."""
     return [run.history for run in runs if run.history is not None]
 
 
 def _place(run: Run | None) -> float:
-    """Return the place of a run's agent; agents without one are behind all others, in their order."""
+    """Return a run's agent's place; agents without one come last."""
     return math.inf if run is None or run.shown is None else run.shown[0]
 
 
 def _rank(value: Any) -> tuple[int, float, str]:
-    """Orders values of a setting: first none, then numbers by size, then others by their text."""
+    """Orders a setting's values: none, numbers by size, then others by text."""
     return (1, value, "") if is_real(value) else (0 if value is None else 2, 0.0, str(value))
 
 
 def _agent_names(runs: Sequence[Run]) -> list[str]:
-    """Each run's agent, with the settings in which it differs from others of the name on the curriculum."""
+    """Each run's agent, with the settings in which it differs on the curriculum."""
     differing = {kind: _differing(some) for kind, some in split_by(runs, _kind).items()}
     twins = split_by(runs, lambda run: run.alike)
     names = []
@@ -463,7 +462,7 @@ def _agent_names(runs: Sequence[Run]) -> list[str]:
 
 
 def code_of(run: Run, others: Sequence[Run]) -> str:
-    """Return in words the code of a run, as far as it differs between others."""
+    """Return in words a run's code, where it differs between others."""
     codes = [other.code for other in others]
     own = run.code
     values = []

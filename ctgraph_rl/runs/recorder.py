@@ -1,4 +1,4 @@
-"""Recorder: anyone's learner, measured by a curriculum's protocol, with the files of a run of our own."""
+"""Recorder: anyone's learner, measured by a curriculum's protocol, with a run's files."""
 
 from __future__ import annotations
 
@@ -39,23 +39,22 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 
 
 class Recorder:
-    """Evaluates policies by the protocol of a curriculum, when its user's own loop asks for it, and keeps a run log.
+    """Evaluates policies by a curriculum's protocol, when your loop asks for it, and keeps a run log.
 
     A policy is one of
 
-    - a function of a batch of observations, uint8 [n, 1, r, r] or [n, K], that returns n integer actions, or float ones
-      where actions are continuous. Where its
-      second argument is named ``task_id``, it gets the one-hot task ids there, uint8 [n, num_task_ids], or None where
-      the protocol shows none;
+    - a function of observations, uint8 [n, 1, r, r] or [n, K], that returns n integer actions, or float ones where
+      actions are continuous. A second argument named ``task_id`` gets the one-hot task ids, uint8 [n, num_task_ids], or
+      None where the protocol shows none;
     - a function ``(observation, state, episode_start)`` that returns ``(actions, state)``, for memory: the first state
       is None, and ``episode_start``, bool [n], says which rows start an episode;
     - an object with ``predict``, such as a model of Stable-Baselines3, greedy where the protocol is;
-    - a plain ``torch.nn.Module`` that maps observations to logits, see `ctgraph_rl.learn.logits_policy.LogitsPolicy`;
+    - a plain ``torch.nn.Module`` from observations to logits, as for `ctgraph_rl.learn.logits_policy.LogitsPolicy`;
     - a TensorDict module without recurrent state, or a class of `ctgraph_rl.policies`.
 
-    Observations are NumPy arrays. Where the protocol shows task ids with observations, any other function and
-    ``predict`` get a dict of ``observation`` and ``task_id``. A function draws its own random numbers: where the
-    protocol is greedy it should take its best action.
+    Observations are NumPy arrays. Where the protocol shows task ids, other functions and ``predict`` get a dict of
+    ``observation`` and ``task_id``. A function draws its own random numbers; where the protocol is greedy it should
+    take its best action.
 
     Use it as a context manager, or call `close`::
 
@@ -72,29 +71,26 @@ class Recorder:
                 recorder.checkpoint(policy.state_dict, frames)
 
     Args:
-        curriculum: what is learned.
-        run_dir: where the files of a run go, all but ``agent.pt``; None: measurements stay in ``log``.
+        run_dir: for a run's files but ``agent.pt``; None: measurements stay in ``log``.
         seed: of the run; evaluations derive theirs from it, in [0, 2**63).
-        about: what else the first line of the log should tell, such as the learner's name and settings, as JSON:
-            ``{"learner": "SAC", "learning_rate": 0.01}``. Runs in one folder that name no learner are one learner, with
-            the folder's name.
-        code: classes and functions that learn; the log then says of which source they are, so that results of changed
-            code are not averaged with those of before. None: it does not say.
-        overwrite: replace the run that the directory holds.
-        resume: resume the run that the directory holds from its last `checkpoint`; one that was stopped before its
-            first starts again. ``saved`` is what was saved, and ``frames`` after how many frames. A run that is
-            finished is shown: ``finished`` is true, ``frames`` is the curriculum's number of frames, so that nothing is
-            learned again, ``log`` and ``metrics`` hold its results, `evaluate` returns what was measured then, and no
-            file is changed.
-        logger: where measurements also go, at once: the name of a file in ``conf/logger``, such as
-            ``"tensorboard"``, or a function that builds a logger of TorchRL in a folder.
+        about: the learner's name and settings for the log, as JSON: ``{"learner": "SAC", "learning_rate": 0.01}``. Runs
+            in one folder that name no learner are one learner, with the folder's name.
+        code: classes and functions that learn; the log records their source, so that results of changed code are not
+            averaged with earlier ones.
+        overwrite: replace the directory's run.
+        resume: resume the directory's run from its last `checkpoint`, or from the start without one. ``saved`` is what
+            was saved, and ``frames`` after how many frames. A finished run is shown: ``finished`` is true, ``frames``
+            is the curriculum's, so that nothing is learned again, ``log`` and ``metrics`` hold its results, `evaluate`
+            returns what was measured, and no file changes.
+        logger: also gets measurements at once: a file in ``conf/logger``, such as ``"tensorboard"``, or a function that
+            builds a logger of TorchRL in a folder.
         checkpoint_seconds: time between two checkpoints within a block, >= 0.
 
     Raises:
-        ValueError: for values out of range, before anything is written; and where a run of other settings or of code
-            that has changed would be resumed.
-        FileExistsError: if the directory holds a run, and neither ``overwrite`` nor ``resume`` says what to do with it.
-        BlockingIOError: if another writer is in the directory, such as a recorder that was not closed.
+        ValueError: before anything is written: for values out of range, or to resume a run of other settings or changed
+            code.
+        FileExistsError: if the directory holds a run, without ``overwrite`` or ``resume``.
+        BlockingIOError: if another writer is there, such as an open recorder.
 
     Example:
         >>> import curricula
@@ -182,7 +178,7 @@ class Recorder:
         return self._member.log
 
     def _open(self, run_dir: Path, overwrite: bool, resume: bool) -> None:
-        """Open the log of a run that begins, of one that is resumed, or of one that is finished."""
+        """Open the log of a new, resumed or finished run."""
         path = run_dir / LOG
         begun = RunLog.begun(path)
         stopped = begun is not None and not (run_dir / METRICS).exists()
@@ -211,7 +207,7 @@ class Recorder:
         self._member.begin(state)
 
     def _check_same(self, begun: Mapping[str, Any]) -> None:
-        """Refuse to resume a run of another curriculum or of other settings; `begin` knows of code."""
+        """Refuse to resume a run of another curriculum or other settings; `begin` checks code."""
         before = begun.get("fingerprint")
         now = self.curriculum.fingerprint
         other = f"{self.run_dir} holds a run of {begun.get('curriculum')} (fingerprint {before}), this one has {now}"
@@ -223,7 +219,7 @@ class Recorder:
         )
 
     def _show(self, run_dir: Path) -> None:
-        """Read the log of a finished run, which nothing is added to."""
+        """Read the log of a finished run."""
         self._member.log = RunLog.read(run_dir / LOG)
         changed = ", ".join(code_changes(self.log.of_kind("run")[0], self._member.about))
         fix = "choose another run_dir, or overwrite=True to run it again"
@@ -234,19 +230,18 @@ class Recorder:
 
     @takes_numbers
     def checkpoint(self, state: Callable[[], Mapping[str, Any]], frames: int) -> None:
-        """Save the learner if it is time: at first, where a block ends, and when ``checkpoint_seconds`` have passed.
+        """Save the learner if it is time: at first, at a block's end, and after ``checkpoint_seconds``.
 
-        A run that was stopped is resumed from its last checkpoint that can be read. Measurements that were logged after
-        it are removed, since they are made again.
+        A stopped run resumes from its last readable checkpoint. Later measurements are removed and made again.
 
         Args:
-            state: a function that makes what the learner needs to learn on, as tensors and plain Python values, such as
+            state: makes what the learner needs to learn on, as tensors and plain Python values, such as
                 ``model.state_dict``; `saved` is what it returned.
-            frames: frames learned from so far, at least those of the last evaluation and training.
+            frames: frames learned so far, at least those of the last evaluation and training.
 
         Raises:
-            ValueError: for frames out of order or beyond the curriculum, without a run_dir, and for a state that cannot
-                be read back.
+            ValueError: for frames out of order or beyond the curriculum, without a run_dir, and for an unreadable
+                state.
         """
         least = max(self._evaluated, self._trained, self.frames)
         last = self.curriculum.num_frames
@@ -270,28 +265,27 @@ class Recorder:
 
     @property
     def moments(self) -> tuple[int, ...]:
-        """All numbers of frames after which the protocol wants an evaluation."""
+        """All frames after which the protocol wants an evaluation."""
         return self.curriculum.moments
 
     @takes_numbers
     def evaluate(
         self, policy: Any = None, frames: int = 0, policy_for: Callable[[int], Any] | None = None
     ) -> dict[str, float]:
-        """Evaluate after ``frames`` frames of the run, on the tasks and in the way that the protocol says.
+        """Evaluate by the protocol after ``frames`` frames of the run.
 
-        Evaluations after exactly the frames at the end of a block are rows of the performance matrix. Any other one is
-        logged as an evaluation during a block.
+        Evaluations exactly at a block's end are rows of the performance matrix, others are logged as during a block.
 
         Args:
-            policy: what plays; see the class.
-            frames: frames learned from so far, more than at the last evaluation.
+            policy: of a kind that the class lists.
+            frames: frames learned so far, more than at the last evaluation.
             policy_for: instead of ``policy``, where the protocol gives task ids: the policy for an id.
 
         Returns:
             The mean return on each task, by label.
 
         Raises:
-            ValueError: for frames out of order or beyond the curriculum, and what is not a policy.
+            ValueError: for frames out of order or beyond the curriculum, and other than policies.
         """
         if self.finished:
             return self._measured(frames)
@@ -310,22 +304,21 @@ class Recorder:
         return self._measured(frames)
 
     def _measured(self, frames: int) -> dict[str, float]:
-        """Return the mean return on each task, by label, after a number of frames."""
         found = {m["label"]: m["return_mean"] for m in self.log.of_kind("evaluation") if m["frames"] == frames}
         require((bool(found), f"the run is finished and has no evaluation after {frames!r} frames"))
         return found
 
     @takes_numbers
     def training(self, frames: int, **values: Any) -> None:
-        """Log what was measured while training since the last time, or the start of the block.
+        """Log what training measured since the last time, or the start of the block.
 
         Args:
-            frames: frames learned from so far, more than the last time.
+            frames: frames learned so far, more than the last time.
             values: numbers by name: ``return_mean``, ``success_rate`` and ``length_mean`` of the finished ``episodes``,
                 which metrics use, and any others.
 
         Raises:
-            ValueError: for frames out of order or beyond the curriculum, and values that are no numbers.
+            ValueError: for frames out of order or beyond the curriculum, and other values than numbers.
         """
         last = self.curriculum.num_frames
         numbers = {name: plain(value) for name, value in values.items()}
@@ -344,13 +337,13 @@ class Recorder:
 
     @property
     def metrics(self) -> NamedValues:
-        """The metrics of the evaluations so far; what is missing makes them undefined, with the reason."""
+        """The metrics of the evaluations so far, undefined with the reason where some are missing."""
         return dict(scores(self.log, self.curriculum))
 
     def close(self) -> None:
         """Write tables and metrics, close the log and the logger, and remove the checkpoints.
 
-        A run without the last evaluation of the protocol is not finished: it gets no results and keeps its checkpoints.
+        Without the protocol's last evaluation a run is unfinished: it gets no results and keeps its checkpoints.
         """
         session = self._session
         self._session = None
@@ -366,12 +359,12 @@ class Recorder:
                 self._member.finish()
 
     def _open_rule(self) -> Rule:
-        """Return the rule that this is not closed: another writer may be in its directory."""
+        """Return the rule that this is open: else another writer may be in its directory."""
         is_open = self.run_dir is None or self.finished or self._session is not None
         return is_open, f"this Recorder of {self.run_dir} is closed: a Recorder with resume=True resumes its run"
 
     def __getstate__(self) -> NamedValues:
-        """Return what a copy has; two recorders cannot write into one directory."""
+        """Return a copy's state; two recorders cannot write into one directory."""
         if self.run_dir is not None and not self.finished:
             raise TypeError(f"a Recorder that writes into {self.run_dir} has no copies; copy one without a run_dir")
         return dict(vars(self))

@@ -1,8 +1,7 @@
 """A session: runs that this process writes at once, each begun or resumed in a locked directory, and finished there.
 
-A single run is a session of one member, and so is that of a `ctgraph_rl.runs.recorder.Recorder`. Seeds that learn as
-one batch, single-task experts and the learners of a collective are sessions of several. A `SessionCoupling` lets them
-learn.
+A single run, or a `ctgraph_rl.runs.recorder.Recorder`, is a session of one member; seeds that learn as one batch,
+experts and collectives are sessions of several. A `SessionCoupling` lets them learn.
 """
 
 from __future__ import annotations
@@ -52,26 +51,26 @@ if TYPE_CHECKING:
 START_AGAIN = "overwrite=stale runs it again from the beginning, as overwrite=true does with any run"
 
 RESTARTS = "restarts.jsonl"
-"""Says, for a run that was stopped, where it was resumed and on which machine."""
+"""Where a stopped run was resumed, and on which machine."""
 
 Failures = dict[int, FloatingPointError]
-"""The error of each that failed: by its position in a session, or by its seed."""
+"""Errors by position in a session, or by seed."""
 
 Opened = TypeVar("Opened")
 
 
 @dataclass(kw_only=True, eq=False)
 class RunMember(Member):
-    """A learner, and the directory that its run is written into. Its log is in memory until `begin`.
+    """A learner and its run's directory. Its log is in memory until `begin`.
 
     Args:
         run_dir: an existing directory.
-        config: what the first line of the log holds of settings, the seed among them, as JSON.
-        checkpoints: those in the directory.
-        sources: classes and functions that learn, for `provenance`; None if they are not known.
-        together: the seeds of the batch that the run is trained in; none for a single run.
-        experts: the single-task expert of each task; they are named in the log.
-        listeners: are called with every measurement.
+        config: settings in the log's first line, with the seed, as JSON.
+        checkpoints: the directory's.
+        sources: classes and functions that learn, for `provenance`, if known.
+        together: the seeds of its batch; none for a single run.
+        experts: each task's single-task expert, named in the log.
+        listeners: called with every measurement.
     """
 
     run_dir: Path
@@ -91,10 +90,10 @@ class RunMember(Member):
         return {**about, "config": self.config}
 
     def begin(self, saved: RunState | None) -> None:
-        """Open the log of a new run, or of one that is resumed from a saved state.
+        """Open the log of a new run, or of one resumed from a saved state.
 
         Raises:
-            ValueError: if the log does not fit the saved state; if ``strict``, for another machine or versions, too.
+            ValueError: if the log does not fit the saved state; if ``strict``, also for another machine or versions.
         """
         about = self.about
         if saved is not None:
@@ -121,7 +120,7 @@ class RunMember(Member):
             print(f"note: {said}: {terminal_text(error)}")
 
     def _check_unchanged(self, about: ReadOnlyValues) -> None:
-        """Refuse to resume by other code; warn of another machine or versions, or refuse them if ``strict``."""
+        """Refuse to resume by other code; warn of another machine or versions, or refuse if ``strict``."""
         run_dir = self.run_dir
         before = RunLog.begun(run_dir / LOG) or {}
         lost = f"{run_dir} has checkpoints, but no {LOG} of a run: restore it, or start with overwrite=true"
@@ -138,7 +137,7 @@ class RunMember(Member):
             warnings.warn(message, stacklevel=2)
 
     def finish(self) -> None:
-        """Write the weights and the results of a run that has ended."""
+        """Write the weights and results of a run."""
         self.log.close()
         if self.agent is not None:
             weights = io.BytesIO()
@@ -153,7 +152,7 @@ class SessionCoupling(Protocol):
     """Lets the members of a session learn."""
 
     def resume(self, members: Sequence[RunMember]) -> Sequence[RunState | None]:
-        """Return the state that each is resumed from, None where it begins; remove what was half written.
+        """Return the state that each resumes from, None to begin; remove half-written files.
 
         Raises:
             ValueError: if they cannot be resumed, or cannot learn.
@@ -163,20 +162,16 @@ class SessionCoupling(Protocol):
     def learn(
         self, members: Sequence[RunMember], saved: Sequence[RunState | None], console: Console | None
     ) -> Failures:
-        """Let all learn into their logs; return the error of each that failed, by its position."""
+        """Let all learn into their logs; return errors by position."""
         ...
 
     def end(self, members: Sequence[RunMember], failed: Failures) -> None:
-        """Write what all have in common; called when those that did not fail are finished."""
+        """Write what all have in common, once those that did not fail are finished."""
         ...
 
 
 class Session:
-    """Runs that this process writes; a context manager that lets other writers in at its end.
-
-    Args:
-        console: where progress shows; default: standard error.
-    """
+    """Runs that this process writes; a context manager that unlocks at its end. Progress shows on ``console``."""
 
     def __init__(self, console: Console | None = None) -> None:
         self.console = console
@@ -190,14 +185,14 @@ class Session:
         self._stack.__exit__(*error)
 
     def pop_all(self) -> Session:
-        """Return a session that now has what this one would close at its end."""
+        """Return a session that takes over what this one would close."""
         other = Session(self.console)
         other._stack = self._stack.pop_all()
         other._locks = self._locks
         return other
 
     def lock(self, run_dir: Path, waiting: Callable[[], object] | None = None) -> None:
-        """Keep all other writers out of a directory until the end; see `Locks.add`."""
+        """Keep other writers out of a directory until the end, by `Locks.add`."""
         self._locks.add(run_dir, waiting)
 
     def enter(self, part: AbstractContextManager[Opened]) -> Opened:
@@ -205,13 +200,13 @@ class Session:
         return self._stack.enter_context(part)
 
     def learn(self, members: Sequence[RunMember], coupling: SessionCoupling) -> Failures:
-        """Let members learn, each into its directory, which is locked.
+        """Let members learn, each into its locked directory.
 
         Returns:
-            The error of each that failed, by its position; it has no results.
+            Errors of failed ones, without results, by position.
 
         Raises:
-            ValueError: before any work, for members that cannot learn or cannot be resumed.
+            ValueError: before any work, for members that cannot learn or resume.
         """
         saved = coupling.resume(members)
         for member, state in zip(members, saved, strict=True):
@@ -229,11 +224,8 @@ class Session:
 class OneBatch(SessionCoupling):
     """A coupling of seeds that learn one curriculum as one batch, or of a single run.
 
-    Runs that were stopped are resumed from the last checkpoint that all have, and end as if they had never stopped.
-    Those that were stopped in their first checkpoints begin again.
-
-    Args:
-        device: where the environment lives, and the agents.
+    Stopped runs resume from the last checkpoint that all have, and end as if they had never stopped. Those stopped in
+    their first checkpoints begin again. Environment and agents live on ``device``.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -303,7 +295,7 @@ class OneBatch(SessionCoupling):
 
 
 def _same_group(member: RunMember) -> Rule:
-    """The rule that a run is resumed with the seeds beside it with which it was begun, if there were any."""
+    """The rule that a run resumes with the seeds that it began with."""
     before = (RunLog.begun(member.run_dir / LOG) or {}).get("together", [])
     how = "together=true and seed=" + ",".join(map(str, before)) if before else "together=false"
     began = f"{member.run_dir} was begun {f'with the seeds {before} together' if before else 'by itself'}"
@@ -311,7 +303,7 @@ def _same_group(member: RunMember) -> Rule:
 
 
 def _all_begun(member: RunMember, others: Sequence[RunMember]) -> Rule:
-    """The rule that no run of a group has lost its checkpoints, if others have some."""
+    """The rule that no run of a group has lost its checkpoints."""
     named = ", ".join(str(each.run_dir) for each in others)
     lost = f"{member.run_dir} has lost its checkpoints, and learns as one batch with {named}, which have some"
     return not others, f"{lost}: restore them, or start all again with overwrite=true"
@@ -335,7 +327,7 @@ def agents_together(agents: Sequence[object], generators: Sequence[object], devi
 
 @contextmanager
 def mark_failure(run_dir: Path) -> Iterator[None]:
-    """Leave the reason in ``failed.txt`` where a run that began or failed before, or a cell, ends by an error."""
+    """Write ``failed.txt`` with the reason where a run that began or failed before, or a cell, ends by an error."""
     mark = run_dir / FAILURE
     failed_before = mark.exists()
     mark.unlink(missing_ok=True)
@@ -349,7 +341,7 @@ def mark_failure(run_dir: Path) -> Iterator[None]:
 
 
 def write_results(log: RunLog, curriculum: Curriculum, run_dir: Path, experts: Sequence[RunLog] | None = None) -> None:
-    """Write the tables of a log that is closed, the sums of all results and, last of all, the metrics."""
+    """Write a closed log's tables, the sums of all results and, last, the metrics."""
     write_tables(log, run_dir, parquet=False)
     write_performance(run_dir / "performance.csv", log, curriculum.labels)
     metrics = scores(log, curriculum, experts)
@@ -358,21 +350,21 @@ def write_results(log: RunLog, curriculum: Curriculum, run_dir: Path, experts: S
 
 
 def remove_results(run_dir: Path) -> None:
-    """Remove what a run left: first what says that it is complete, last what says that there was one."""
+    """Remove a run's files: first the mark of completeness, last the mark of a run."""
     reopen(run_dir)
     for name in (*reversed(RESULTS[1:]), RESTARTS, LOG):
         (run_dir / name).unlink(missing_ok=True)
 
 
 def reopen(run_dir: Path) -> None:
-    """Remove what says that a run is complete, for good before anything else of it is changed."""
+    """Remove the mark of completeness durably before other changes."""
     if (run_dir / METRICS).exists():
         (run_dir / METRICS).unlink()
         sync_folder(run_dir)
 
 
 def is_whole(run_dir: Path) -> bool:
-    """Return whether the results of a run that says that it is complete are whole; False where it can be resumed.
+    """Return whether a complete run's results are whole; False where it can be resumed.
 
     Raises:
         ValueError: if they are damaged and there is no checkpoint.

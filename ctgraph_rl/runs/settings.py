@@ -1,4 +1,4 @@
-"""The settings of a run as plain values: how they name a run, and how those of two runs are compared."""
+"""A run's settings as plain values: how they name a run, and how two runs compare."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ctgraph_rl.checks import LARGEST_INT, NamedValues, ReadOnlyValues, did_you_
 from ctgraph_rl.packages import conf_dir
 
 SPECS = ("observation_spec", "action_spec", "folder")
-"""Arguments that a run gives itself: to agents the environment's specs, to trackers where to write."""
+"""Arguments that a run gives: environments' specs to agents, folders to trackers."""
 
 HINTS = {"cell": "it has no memory; use agent=lstm_ppo, rl2, drqn or qrdqn_lstm, or leave the cell out"}
 """What to do about settings that only some targets take."""
@@ -28,7 +28,7 @@ LSTM = {
     "reads_action": False,
     "reads_reward": False,
 }
-"""What stands behind the encoder of an agent with memory, unless ``cell=`` says otherwise."""
+"""Stands behind the encoder of an agent with memory, unless ``cell=`` is given."""
 
 _ENCODER: NamedValues = {"encoder": "mlp"}
 _CELL: NamedValues = {"cell": LSTM, **_ENCODER}
@@ -82,10 +82,9 @@ ADDED: dict[str, NamedValues] = {
 }
 """Settings that were added after runs had been stored, each with the value for "as before".
 
-They are listed by the ``_target_`` that takes them, as ``{"baselines.rl2.RL2": {"cell": "lstm"}}``; those of no target
-by their dotted names under ``run``, as ``{"run": {"meta.enabled": False}}``. With this value a setting is part of no
-run name and of no comparison, and stored runs without it have it. So a setting that is added to a yaml file needs an
-entry here, and then no earlier run is lost.
+They are listed by their ``_target_``, as ``{"baselines.rl2.RL2": {"cell": "lstm"}}``; others by dotted names under
+``run``, as ``{"run": {"meta.enabled": False}}``. With this value a setting is in no run name and no comparison, and
+stored runs without it have it. So a new setting of a yaml file needs an entry here, and no earlier run is lost.
 """
 
 
@@ -102,11 +101,11 @@ def flat(settings: ReadOnlyValues, prefix: str = "") -> Iterator[tuple[str, Any]
 
 
 GONE: NamedValues = {"agent.deduplicate": False}
-"""Settings that are gone, with the value that changed nothing: sums of logs and digests of runs leave them out."""
+"""Removed settings, with the value that changed nothing; sums and digests leave them out."""
 
 
 def as_before(settings: ReadOnlyValues) -> NamedValues:
-    """Return the settings of a run without those of `ADDED` that have the value for "as before"."""
+    """Return a run's settings without those of `ADDED` at their value for "as before"."""
     kept = _without(settings, {**ADDED.get("run", {}), **GONE})
     for key, value in kept.items():
         if isinstance(value, Mapping):
@@ -115,7 +114,7 @@ def as_before(settings: ReadOnlyValues) -> NamedValues:
 
 
 def _without(settings: ReadOnlyValues, added: ReadOnlyValues, prefix: str = "") -> NamedValues:
-    """Return nested settings without added ones of this value, and without groups that then are empty."""
+    """Return nested settings without added ones of this value, and without groups left empty."""
     kept: NamedValues = {}
     for key, value in settings.items():
         name = f"{prefix}{key}"
@@ -127,19 +126,19 @@ def _without(settings: ReadOnlyValues, added: ReadOnlyValues, prefix: str = "") 
 
 
 def _added_to(group: Any) -> NamedValues:
-    """Return the settings that were added to the target of a group."""
+    """Return the settings added to a group's target."""
     return ADDED.get(str(group.get("_target_")), {}) if isinstance(group, Mapping) else {}
 
 
 def with_added(settings: ReadOnlyValues) -> NamedValues:
-    """Return the settings of a stored group, such as ``agent``, with those that were added to its target since."""
+    """Return a stored group's settings, such as ``agent``, with those added since."""
     return {**_added_to(settings), **settings}
 
 
 def parameters_of(function: Any) -> dict[str, Parameter]:
-    """Return the arguments of a function or class by name.
+    """Return a function's or class's arguments by name.
 
-    Those that a class takes as ``**`` are those of its ``Settings``, mostly a dataclass, or else of its base.
+    A class's ``**`` stands for its ``Settings``, mostly a dataclass, or else its base's arguments.
     """
     own = signature(function).parameters
     stars = (Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD)
@@ -151,10 +150,10 @@ def parameters_of(function: Any) -> dict[str, Parameter]:
 
 
 def check_arguments(group: str, given: Sequence[str], function: Any) -> None:
-    """Refuse settings of a group that what it builds does not take, and ones that are missing.
+    """Refuse unknown and missing settings of a group.
 
     Raises:
-        ValueError: with the one that was probably meant or the choices.
+        ValueError: with the likely one or the choices.
     """
     parameters = parameters_of(function)
     choices = [name for name in parameters if name not in SPECS]
@@ -170,12 +169,12 @@ def check_arguments(group: str, given: Sequence[str], function: Any) -> None:
 
 
 def names_in(folder: Path | str, group: str) -> list[str]:
-    """Return the names of a group's yaml files in a configuration directory."""
+    """Return the names of a group's yaml files."""
     return sorted(path.stem for path in Path(folder, group).glob("*.yaml"))
 
 
 def curriculum_names(config_dir: Path | None) -> list[str]:
-    """Return the names of the curricula in a configuration directory.
+    """Return a configuration directory's curricula.
 
     Raises:
         ValueError: if there is no such directory.
@@ -187,13 +186,13 @@ def curriculum_names(config_dir: Path | None) -> list[str]:
 
 
 def digest(settings: ReadOnlyValues) -> str:
-    """Return the hash of settings that a run's name ends with: 12 hexadecimal digits."""
+    """Return the hash at the end of a run's name: 12 hexadecimal digits."""
     text = json.dumps(as_before(settings), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def differences(stored: ReadOnlyValues, given: ReadOnlyValues) -> list[str]:
-    """Return in words which settings of a stored run differ from those that are given."""
+    """Return in words how a stored run's settings differ from given ones."""
     before = dict(flat(as_before(stored)))
     now = dict(flat(as_before(given)))
     found = []
@@ -207,15 +206,15 @@ def differences(stored: ReadOnlyValues, given: ReadOnlyValues) -> list[str]:
 
 
 def _value_before(key: str, given: ReadOnlyValues) -> Any:
-    """Return the value that stands for a setting that was added later."""
+    """Return the value of a setting that was added later."""
     group, _, name = key.partition(".")
     return dict(flat(_added_to(given.get(group)))).get(name, ADDED.get("run", {}).get(key))
 
 
 def in_digits(arguments: Sequence[str]) -> list[str]:
-    """Write whole numbers such as ``1e5`` in digits, in the arguments of a command line.
+    """Write whole numbers such as ``1e5`` in digits, in a command line's arguments.
 
-    Settings that have a fraction or a text in a file of ``conf`` are left unchanged.
+    Settings with a fraction or text in a file of ``conf`` stay unchanged.
     """
     written = []
     for each in arguments:
@@ -233,7 +232,7 @@ def _whole(number: re.Match[str]) -> str:
 
 
 def _defaults(name: str) -> Iterator[Any]:
-    """Yield the values that a setting has in the files of ``conf``."""
+    """Yield a setting's values in the files of ``conf``."""
     group, _, key = name.rpartition(".")
     folder = Path(conf_dir(), group)
     for path in folder.glob("*.yaml") if group and folder.is_dir() else (Path(conf_dir(), "config.yaml"),):
@@ -244,15 +243,14 @@ def _defaults(name: str) -> Iterator[Any]:
 
 
 def as_typed(message: str, settings: ReadOnlyValues, typed: Iterable[str]) -> str:
-    """Return a message about values with the names of settings that are typed: ``curriculum.depth`` for ``depth``.
+    """Return a message with the names of settings as typed: ``curriculum.depth`` for ``depth``.
 
-    A word that is no name elsewhere is one only where a rule begins, as in ``depth must be``, and before a ``=``.
-    After a ``=`` it is a value.
+    A word is a name only where a rule begins, as in ``depth must be``, and before a ``=``; after it, a value.
 
     Args:
-        message: that objects gave, which do not know by which setting they were made.
+        message: of objects that do not know their setting.
         settings: all settings of the run.
-        typed: full names of those that were given, which decide where several have the same last part.
+        typed: full names of given ones, which decide between equal last parts.
     """
     homes: dict[str, list[str]] = {}
     for name, _ in flat(settings):

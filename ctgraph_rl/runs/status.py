@@ -1,4 +1,4 @@
-"""The status of a sweep's cells, read from their directories: one line while they run, and what is left at the end."""
+"""The status of a sweep's cells, from their directories: a line while they run, and a report at the end."""
 
 from __future__ import annotations
 
@@ -32,28 +32,28 @@ MISSING = "missing"
 START_AGAIN = "overwrite=stale runs what is stale again, overwrite=true all"
 
 SHOWN = 20
-"""Cells that the report at a sweep's end names."""
+"""Cells in the final report."""
 
 SECONDS_BETWEEN_LINES = 60.0
-"""Where no terminal shows one line that changes."""
+"""Without a terminal."""
 
 
 class Status(NamedTuple):
-    """The state of a cell, and why it is not done."""
+    """A cell's state, and why it is not done."""
 
     state: str
     reason: str = ""
 
 
 class RunOutcome(NamedTuple):
-    """The results and the failure of a run directory, each as what differs once it is written again; None without."""
+    """A run directory's results and failure, each as a mark that changes when they are written again."""
 
     results: Hashable = None
     failure: Hashable = None
 
     @classmethod
     def of(cls, folder: Path) -> RunOutcome:
-        """Return what a directory holds; no clock is compared, for that of another machine may be behind."""
+        """Return a directory's outcome; clocks of machines are not compared."""
         results = _identity(folder / METRICS)
         sums = b""
         with suppress(OSError, ValueError):
@@ -65,7 +65,7 @@ NOTHING = RunOutcome()
 
 
 def holds_results(folder: Path) -> bool:
-    """Return whether a run directory holds results or a checkpoint, which a change of code would make stale."""
+    """Return whether a directory holds results or a checkpoint, which changed code makes stale."""
     return (folder / METRICS).exists() or any((folder / CHECKPOINTS).glob("*.pt"))
 
 
@@ -78,12 +78,12 @@ def _identity(path: Path) -> Hashable:
 
 
 def status_of(folder: Path, before: RunOutcome = NOTHING, error: str | None = None) -> Status:
-    """Return the status of the cell of a run directory.
+    """Return the status of a directory's cell.
 
     Args:
         folder: the directory; need not exist.
-        before: results and failures that do not count, as they were there before the sweep began.
-        error: what it raised, where that is known.
+        before: results and failures from before the sweep, which do not count.
+        error: what it raised, if known.
     """
     now = RunOutcome.of(folder)
     if now.results not in (None, before.results) and is_complete(folder):
@@ -103,7 +103,7 @@ def status_of(folder: Path, before: RunOutcome = NOTHING, error: str | None = No
 
 
 def failure(folder: Path) -> str:
-    """Return why a run failed, as its file says."""
+    """Return why a run failed, by its file."""
     try:
         return read_text(folder / FAILURE, MOST_BYTES_OF_A_REASON)
     except (OSError, ValueError) as error:
@@ -111,7 +111,7 @@ def failure(folder: Path) -> str:
 
 
 def lock_holder(folder: Path) -> str | None:
-    """Return which process has locked a run directory; None for none, or one of this machine that has ended."""
+    """Return which process has locked a directory; None for none, or an ended one of this machine."""
     try:
         holder = read_text(folder / LOCK, MOST_BYTES_OF_A_REASON).partition("\n")[0]
     except (OSError, ValueError):
@@ -128,12 +128,12 @@ def lock_holder(folder: Path) -> str | None:
 
 
 def report(statuses: Mapping[str, Status], repeated: int = 0, most: int | None = SHOWN) -> str:
-    """Report the number of cells in each state, and those that are not done with their reasons.
+    """Report the number of cells by state, and why some are not done.
 
     Args:
         statuses: each cell by its settings.
-        repeated: cells that are left out, since they are there twice.
-        most: cells that are named; None: all.
+        repeated: duplicate cells, left out.
+        most: named cells; None: all.
     """
     counts = Counter(found.state for found in statuses.values())
     states = (DONE, *([STALE] if counts[STALE] else []), FAILED, IN_USE, MISSING)
@@ -152,13 +152,13 @@ def report(statuses: Mapping[str, Status], repeated: int = 0, most: int | None =
 
 
 class SweepProgress(TextBar):
-    """Shows how many cells are done, failed and running on standard error; use it as a context manager.
+    """Shows how many cells are done, failed and running, on standard error; a context manager.
 
-    It looks at their directories every second, or less often where that takes long.
+    It looks at directories every second, or less often if that takes long.
 
     Args:
-        cells: the cells' run directories, each with the outcome before the sweep; see `status_of`.
-        console: where it shows; default: standard error.
+        cells: run directories, each with the outcome before the sweep, as `status_of`.
+        console: where it shows.
     """
 
     def __init__(self, cells: Mapping[Path, RunOutcome], console: Console | None = None) -> None:
@@ -199,7 +199,7 @@ class SweepProgress(TextBar):
                 self._print(text)
 
     def look(self) -> tuple[int, int, int]:
-        """Return the numbers of cells that are done, failed and running."""
+        """Return the numbers of cells done, failed and running."""
         counts: Counter[str] = Counter()
         for folder, before in list(self._left.items()):
             state = status_of(folder, before).state
@@ -209,13 +209,13 @@ class SweepProgress(TextBar):
         return self.total - len(self._left), counts[FAILED], counts[IN_USE]
 
     def describe(self, done: int, failed: int, running: int, ended: int, seconds: float) -> str:
-        """Return one line: cells done, failed and running, rate and time left.
+        """Return one line: cells done (also before), failed and running, rate and time left.
 
         Args:
-            done: cells that are done, also before.
+            done: also before.
             failed: cells that failed.
             running: cells that run.
-            ended: cells that ended in `seconds`, done or failed.
+            ended: done or failed in ``seconds``.
             seconds: time of this start.
         """
         rate = ended / seconds

@@ -1,4 +1,4 @@
-"""A sweep: only the cells that are not done are launched, a failed cell stops no other, and all are reported."""
+"""A sweep: only cells that are not done are launched, a failed cell stops no other, and all are reported."""
 
 from __future__ import annotations
 
@@ -52,14 +52,14 @@ Overrides = Sequence[str]
 """The settings of one cell, as on the command line."""
 
 ALL_CORES = -1
-"""Of joblib's number of processes."""
+"""joblib's number of processes."""
 
 SUBDIR = "${run_name:}"
-"""Names a directory after the configuration; a cell can then be found before it is run."""
+"""Names a directory after the configuration, so that a cell is found before it runs."""
 
 
 def swept(params: ReadOnlyValues) -> dict[str, list[str]]:
-    """Return the choices of each swept setting as on a command line: ``seed=0``, ``seed=1`` of ``range(2)``."""
+    """Return the choices of each swept setting as typed: ``seed=0``, ``seed=1`` of ``range(2)``."""
     parser = OverridesParser.create()
     found = {}
     for key, value in params.items():
@@ -69,17 +69,17 @@ def swept(params: ReadOnlyValues) -> dict[str, list[str]]:
 
 
 class Sweeper(Base):
-    """Sweeps over all combinations of choices, with any launcher; to be mixed into Hydra's ``BasicSweeper``.
+    """Sweeps over all combinations of choices, with any launcher; a mixin of Hydra's ``BasicSweeper``.
 
     Args:
-        max_batch_size: cells that are given to the launcher at a time; None: all.
+        max_batch_size: cells given to the launcher at a time; None: all.
         params: what is swept, beside the command line.
         status: only report the status of each cell.
-        variants: settings that change together, each combined with all of ``params``; None: there are none.
+        variants: settings that change together, each combined with all of ``params``.
     """
 
     done: ClassVar[Sequence[Path]] = ()
-    """Run directories of the last sweep of this process that is done."""
+    """Run directories of this process's last finished sweep."""
 
     def __init__(
         self,
@@ -98,7 +98,7 @@ class Sweeper(Base):
         self._num_unknown = 0
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
-        """Set up as Hydra does; a launcher for all cores gets as many processes as have ``num_threads`` each."""
+        """Set up as Hydra does; a launcher for all cores gets processes of ``num_threads`` each."""
         own = deepcopy(config)
         if config.hydra.launcher.get("n_jobs") == ALL_CORES:
             cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -110,14 +110,13 @@ class Sweeper(Base):
         self.launcher.setup(hydra_context=hydra_context, task_function=task_function, config=config)
 
     def sweep(self, arguments: list[str]) -> None:
-        """Run the cells that are not done, then report the status of all.
+        """Run the cells that are not done, then report on all.
 
-        Cells that were run with other code are stale. They are run again only with ``overwrite``; without it nothing
-        is run then.
+        Cells of other code are stale: they run again with ``overwrite``; without it nothing runs.
 
         Raises:
             ValueError: if ``overwrite`` is not true, false or stale.
-            SystemExit: with code 75 if all that are not done are in use, and 1 if others are not done.
+            SystemExit: with code 75 if all that are not done are in use, else 1.
         """
         assert self.config is not None
         overwrite = self.config.overwrite
@@ -160,7 +159,7 @@ class Sweeper(Base):
             Sweeper.done = list(cells)
 
     def _combined(self, variant: ReadOnlyValues, arguments: Sequence[str]) -> list[list[str]]:
-        """Return all combinations of a variant with what is swept; the last value of a setting counts."""
+        """Return all combinations of a variant with what is swept; a setting's last value counts."""
         own = [f"{key}={value}" for key, value in variant.items()]
         assert self.hydra_context is not None
         parser = OverridesParser.create(config_loader=self.hydra_context.config_loader)
@@ -176,7 +175,7 @@ class Sweeper(Base):
         """Refuse a pattern that chooses no file.
 
         Raises:
-            ValueError: names the files that there are.
+            ValueError: names the existing files.
         """
         assert self.hydra_context is not None
         group = parsed.key_or_group
@@ -192,16 +191,12 @@ class Sweeper(Base):
         return Status(STALE, f"{self._stale[folder]} changed") if stale else found
 
     def cells(self, batch: Sequence[Overrides]) -> dict[Path, Overrides]:
-        """Return the cells by their run directories; of equal ones only the first.
+        """Return the cells by run directory, the first of equal ones; changes of code are kept, unless all run again.
 
-        Changes of code since a cell was run are kept, unless all are run again.
-
-        Cells that choose the same files and set the same values differ only in these, so only the first of them is
-        composed.
+        Of cells that choose the same files and set the same values only the first is composed.
 
         Raises:
-            ValueError: if directories are not named after the configuration, and for a seed or another of the run's own
-                values that is out of range.
+            ValueError: if directories are not named after the configuration, and for run settings out of range.
             HydraException: for what cannot be composed.
         """
         assert self.config is not None and self.hydra_context is not None
@@ -236,7 +231,7 @@ class Sweeper(Base):
         """Return the configuration of a cell.
 
         Raises:
-            ValueError: for a setting that is unknown there; names what the cell chooses.
+            ValueError: for an unknown setting; names the cell's choices.
         """
         assert self.config is not None and self.hydra_context is not None
         try:
@@ -248,7 +243,7 @@ class Sweeper(Base):
             raise ValueError(f"{cell}{explain(error)}") from error
 
     def _compare(self, cfg: DictConfig, folder: Path) -> None:
-        """Keep in words what code has changed since a cell was run, if it was, or that this is unknown."""
+        """Keep in words what code has changed since a cell was run, or that this is unknown."""
         if not holds_results(folder):
             return
         check_packages()
@@ -267,7 +262,7 @@ class Sweeper(Base):
         self._num_unknown += unknown
 
     def _value(self, setting: str) -> tuple[str, Any] | None:
-        """Return key and value of a setting that changes a value; None for one that chooses a file, adds or removes."""
+        """Return a setting's key and value; None for one that chooses a file, adds or removes."""
         assert self.hydra_context is not None
         if setting not in self._values:
             [parsed] = OverridesParser.create().parse_overrides([setting])
@@ -280,10 +275,9 @@ class Sweeper(Base):
         return self._values[setting]
 
     def _jobs(self, cells: Mapping[Path, Overrides]) -> dict[Overrides, list[Path]]:
-        """Return the settings of jobs, each with the cells that it runs: one, or with ``together`` those of all seeds.
+        """Return the settings of jobs, each with its cells: one, or with ``together`` all seeds.
 
-        Cells that were begun together stay together, with those of them that have no checkpoint yet, and one that was
-        begun by itself stays so.
+        Cells that began together, or singly, stay so; those without a checkpoint join.
         """
         assert self.config is not None
         if not self.config.together:
@@ -315,7 +309,7 @@ class Sweeper(Base):
         return jobs
 
     def _launch(self, jobs: Mapping[Overrides, Sequence[Path]], errors: dict[Path, str]) -> None:
-        """Let the launcher run the jobs; collect what they raise by the directories of their cells."""
+        """Let the launcher run the jobs; collect errors by directory."""
         assert self.config is not None and self.launcher is not None
         folder = Path(self.config.hydra.sweep.dir)
         folder.mkdir(parents=True, exist_ok=True)
@@ -336,7 +330,7 @@ class Sweeper(Base):
 
 @contextmanager
 def sigterm_exits() -> Iterator[None]:
-    """Let SIGTERM end the sweep as Ctrl-C does, so that a launcher can end its processes."""
+    """Let SIGTERM end the sweep as Ctrl-C does, so that a launcher ends its processes."""
 
     def leave(number: int, frame: FrameType | None) -> None:
         sys.exit(128 + number)
@@ -361,16 +355,15 @@ def why(job: JobReturn) -> str:
 
 
 def shortened(cells: Sequence[Overrides]) -> list[str]:
-    """Return the cells' settings without those that all of them have."""
+    """Return the cells' settings without those shared by all."""
     common = set.intersection(*map(set, cells)) if len(cells) > 1 else set()
     return [" ".join(setting for setting in cell if setting not in common) for cell in cells]
 
 
 def sweepable(arguments: Sequence[str]) -> list[str]:
-    """Write settings of groups, such as ``agent.compile=true``, as choices of one value in the command line of a sweep.
+    """Write settings of groups, such as ``agent.compile=true``, as choices of one value for a sweep.
 
-    Hydra composes what a sweep's cells have in common with the default of every group that is swept, and would refuse
-    a setting that this default lacks.
+    Hydra first composes swept groups with their defaults, and would refuse a setting that a default lacks.
     """
     groups = "|".join(path.name for path in Path(conf_dir()).iterdir() if path.is_dir() and path.name != "hydra")
     setting = re.compile(rf"((?:{groups})\.[\w.]+)=(.+)")

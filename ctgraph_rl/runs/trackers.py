@@ -1,7 +1,7 @@
 """Trackers: a run's measurements in CSV files, TensorBoard, W&B, MLflow or Trackio, while it learns.
 
-``logger=NAME`` on the command line chooses one of TorchRL's loggers. The run's own files do not depend on it, and what
-goes wrong with it cannot stop a run that has begun.
+``logger=NAME`` chooses one of TorchRL's loggers. The run's own files do not depend on it, and its errors cannot stop a
+run that has begun.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.runs import config
 
 FOLDER = "tracker"
-"""The folder in the run's directory that trackers write into."""
+"""Trackers' folder in the run's directory."""
 
 MODES = ("offline", "online")
 """Of W&B."""
@@ -38,20 +38,20 @@ ENVIRONMENT = {
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "3",
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",
 }
-"""Where the user sets nothing else: no package reports home, and a server that is down costs seconds, not minutes."""
+"""Defaults: no package reports home, and a server that is down costs seconds, not minutes."""
 
 NOT_SENT = ("frames", "task")
-"""Numbers of a measurement that are its step and its name."""
+"""Numbers that are a measurement's step and name."""
 
 
 class Tracker:
     """Sends measurements to a logger: a listener of a run's log, and a context manager that closes the logger.
 
-    The logger's first error is a warning, and then nothing more is sent.
+    After the logger's first error, a warning, nothing more is sent.
 
     Args:
-        make_logger: builds the logger, of a folder that is there and empty.
-        run_dir: the run's directory, in which the folder is replaced, as a resumed run sends all measurements again.
+        make_logger: builds the logger of an empty folder.
+        run_dir: the folder there is replaced, as a resumed run sends all measurements again.
         hyperparameters: the settings that the logger records.
 
     Raises:
@@ -79,7 +79,7 @@ class Tracker:
         self._send("log_hparams", given)
 
     def __call__(self, measurement: ReadOnlyValues) -> None:
-        """Send one measurement, with the run's frames as the step; before the first, those of a resumed run's log."""
+        """Send one measurement, with the run's frames as the step; before the first, a resumed run's."""
         log = self._log
         self._log = None
         if log is not None and log.exists():
@@ -112,10 +112,10 @@ class Tracker:
 
 
 def logger_of(given: Any) -> Callable[..., Any] | None:
-    """Return what builds a logger in a folder: a function unchanged, or that of a name in ``conf/logger``.
+    """Return what builds a logger in a folder: a given function, or by a name in ``conf/logger``.
 
     Raises:
-        ValueError: for an unknown name, with the one that was probably meant, and for what is neither.
+        ValueError: for an unknown name, with the likely one, and for other values.
     """
     fits = given is None or isinstance(given, str) or callable(given)
     require((fits, f"logger must be a name such as 'csv', a function of a folder, or None, got {given!r:.80}"))
@@ -123,10 +123,10 @@ def logger_of(given: Any) -> Callable[..., Any] | None:
 
 
 def scalars(measurement: ReadOnlyValues) -> dict[str, float]:
-    """Return the numbers of a measurement of training or evaluation, named as ``train/return_mean``; none of another.
+    """Return the numbers of a training or evaluation measurement, named as ``train/return_mean``.
 
-    Those of a task have its label in the name, with ``_`` for what is no letter, digit or hyphen: W&B takes what is
-    before a dot for another group, and MLflow and TensorBoard take no ``#``.
+    A task's have its label, with ``_`` for anything but letters, digits and hyphens: in W&B dots begin groups, and
+    MLflow and TensorBoard take no ``#``.
     """
     if measurement["kind"] == "training":
         group = "train"
@@ -138,7 +138,7 @@ def scalars(measurement: ReadOnlyValues) -> dict[str, float]:
 
 
 def csv_logger(folder: Path) -> Logger:
-    """One CSV file for each number, of steps and values."""
+    """One CSV file of steps and values per number."""
     return CSVLogger(exp_name="", log_dir=str(folder))
 
 
@@ -152,9 +152,8 @@ def wandb_logger(folder: Path, mode: str, project: str) -> Logger:
     """A run of Weights & Biases.
 
     Args:
-        folder: where its files are.
         mode: ``offline`` or ``online``.
-        project: what runs are grouped under.
+        project: groups runs.
     """
     require((mode in MODES, f"logger.mode must be one of {', '.join(MODES)}, got {mode!r}"))
     _need("wandb")
@@ -172,16 +171,15 @@ def mlflow_logger(folder: Path, uri: str | None, experiment: str) -> Logger:
     """A run of MLflow.
 
     Args:
-        folder: where its files are.
         uri: address of a store; None makes one in the folder.
-        experiment: what runs are grouped under.
+        experiment: groups runs.
     """
     _need("mlflow")
     return _MLFlow(folder, uri, experiment)
 
 
 class _MLFlow(MLFlowLogger):
-    """TorchRL's logger with a name for the run, which ends with it."""
+    """TorchRL's logger with a run name; the run ends with it."""
 
     def __init__(self, folder: Path, uri: str | None, experiment: str) -> None:
         import mlflow
@@ -198,12 +196,7 @@ class _MLFlow(MLFlowLogger):
 
 
 def trackio_logger(folder: Path, project: str) -> Logger:
-    """A run of Trackio.
-
-    Args:
-        folder: where its files are.
-        project: what runs are grouped under.
-    """
+    """A run of Trackio; ``project`` groups runs."""
     _need("trackio")
     os.environ["TRACKIO_DIR"] = str(folder)
     for name in [name for name in sys.modules if name.split(".")[0] == "trackio"]:
@@ -212,7 +205,7 @@ def trackio_logger(folder: Path, project: str) -> Logger:
 
 
 def _need(package: str) -> None:
-    """Check that a package is there, and set its environment before it is imported."""
+    """Check for a package, and set its environment before its import."""
     if find_spec(package) is None:
         raise ModuleNotFoundError(f"logger={package} needs {package}: pip install 'ctgraph_rl[{package}]'")
     for name, value in ENVIRONMENT.items():
@@ -220,5 +213,5 @@ def _need(package: str) -> None:
 
 
 def _name(folder: Path) -> str:
-    """A run's name from its directory, such as ``su_b1_4tasks/dqn-seed0-1a2b3c4d``."""
+    """A run's name by its directory, such as ``su_b1_4tasks/dqn-seed0-1a2b3c4d``."""
     return "/".join(folder.parent.parts[-2:])

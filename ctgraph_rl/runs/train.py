@@ -1,4 +1,4 @@
-"""A run in a directory: an agent learns a curriculum, and its measurements, metrics and weights are files."""
+"""A run in a directory: an agent learns a curriculum, and leaves measurements, metrics and weights."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ from ctgraph_rl.runs.session import OneBatch, RunMember, Session
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 MakeAgent = Callable[[Composite, TensorSpec], Agent]
-"""Builds an agent for an environment's unbatched observation and action specs."""
+"""Builds an agent of unbatched observation and action specs."""
 
 MEMBERS = (
     *("num_envs", "num_steps", "policy", "policy_for", "initial_state"),
     *("start_task", "end_task", "learn", "to", "state_dict"),
 )
-"""Members that a run needs of an agent."""
+"""What a run needs of an agent."""
 
 
 def new_agent(curriculum: Curriculum, make_agent: MakeAgent, seed: int, device: torch.device | str = "cpu") -> Agent:
-    """Build an agent with weights that come from the seed, which sets torch's global generator.
+    """Build an agent with weights by the seed of torch's global generator.
 
     Raises:
         ValueError: if it cannot learn the curriculum.
@@ -78,7 +78,7 @@ def _agent_rule(agent: object) -> Rule:
 
 
 def _takes_specs(make_agent: Callable[..., object]) -> Rule:
-    """The rule that a function can be called with the two specs."""
+    """The rule that a function takes the two specs."""
     try:
         signature(make_agent).bind(None, None)
     except TypeError as error:
@@ -90,7 +90,7 @@ def _takes_specs(make_agent: Callable[..., object]) -> Rule:
 
 
 def with_method(make_agent: MakeAgent, make_method: Callable[[], MethodLike], curriculum: Curriculum) -> MakeAgent:
-    """Return a function that builds an agent and attaches a new method to it."""
+    """Return a function that builds an agent with a new method."""
     return lambda observation_spec, action_spec: make_method().attach(
         make_agent(observation_spec, action_spec), curriculum
     )
@@ -110,25 +110,24 @@ def train(
     listeners: Sequence[Callable[[NamedValues], object]] = (),
     console: Console | None = None,
 ) -> None:
-    """Let a new agent learn a curriculum, with a progress bar, and write `RESULTS` to a directory.
+    """Let a new agent learn a curriculum, with a progress bar, and write `RESULTS`.
 
-    A run that was stopped there is resumed from its last checkpoint, and ends as if it had never been stopped.
+    A stopped run resumes from its last checkpoint, and ends as if it had never stopped.
 
     Args:
-        curriculum: what is learned.
-        agent: just built by `new_agent`, so that torch's global generator is as its construction left it.
+        agent: just built by `new_agent`, which decides torch's global generator.
         run_dir: an existing directory.
-        seed: decides the run, in [0, 2**63).
-        device: where the environment lives, and the agent.
-        config: what the first line of the log holds beside the seed, as JSON.
-        experts: the single-task expert of each task; they are named in the log.
-        checkpoints: default: those in the directory, every five minutes.
-        listeners: are called with every measurement.
+        seed: in [0, 2**63).
+        device: of environment and agent.
+        config: for the log's first line beside the seed, as JSON.
+        experts: each task's single-task expert, named in the log.
+        checkpoints: default: in the directory, every five minutes.
+        listeners: called with every measurement.
         console: where progress shows; default: standard error.
 
     Raises:
-        ValueError: before any work, for arguments out of range and an agent that cannot learn the curriculum; and if
-            the directory holds a run that cannot be resumed.
+        ValueError: before any work, for arguments out of range, an agent that cannot learn the curriculum, and a run
+            that cannot be resumed.
         BlockingIOError: if another writer is in the directory.
     """
     run_dir = as_path("run_dir", run_dir)

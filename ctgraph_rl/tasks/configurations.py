@@ -40,7 +40,7 @@ def ct_graph(
         branching_factor: b >= 2.
         depth: d >= 1.
         wait_prob: p in [0, 1).
-        goal: d decisions in 1..b, such as ``"1.2"``; None: always the first branch.
+        goal: d decisions in 1..b, such as ``"1.2"``; None: all 1.
         fully_observable: an image for each state; False: surjective, images 0 to 4 for home, fail, decision, wait and
             end.
         one_hot: vectors instead of images.
@@ -79,7 +79,6 @@ def ct_fo_b1(goal: Goal = "1.1", image_seed: int = 1) -> Task:
 
     Args:
         goal: two decisions in 1..2, such as ``"1.2"``.
-        image_seed: seed of the image set.
     """
     return ct_graph(2, 2, 0.0, goal, image_seed=image_seed)
 
@@ -89,7 +88,6 @@ def ct_fo_b2(goal: Goal = "1.1.1", image_seed: int = 1) -> Task:
 
     Args:
         goal: three decisions in 1..2, such as ``"1.2.1"``.
-        image_seed: seed of the image set.
     """
     return ct_graph(2, 3, 0.5, goal, image_seed=image_seed)
 
@@ -150,13 +148,13 @@ class UnknownFieldError(ValueError, TypeError):
 
 @takes_numbers
 def make_task(task: Task | str | None = None, config: Json | None = None, **changes: Any) -> Task:
-    """A task from what ``gymnasium.make`` is given.
+    """A task from the arguments of ``gymnasium.make``.
 
     Args:
         task: a task, or the name of one of the paper's configurations.
-        config: a configuration file of the authors' implementation or its content, for `Task.from_json` with ``goal``.
-        changes: ``image_seed``, and fields of `Task`, `CTGraph` and `Observations` that shall be different. Without
-            task and config also the arguments of `ct_graph`.
+        config: a file of the authors' implementation or its content, for `Task.from_json` with ``goal``.
+        changes: ``image_seed``, and fields of `Task`, `CTGraph` and `Observations` to change. Without task and config
+            also the arguments of `ct_graph`.
 
     Raises:
         UnknownFieldError: a ``ValueError``, for changes that are no fields.

@@ -62,8 +62,8 @@ def is_paper_json(content: ReadOnlyValues) -> bool:
 def read_paper_json(source: str, content: ReadOnlyValues, goal: Goal | None) -> NamedValues:
     """Return the arguments of `Task` for the parameters of Table 3.
 
-    Ids that are left out are the next free ones after those of the home state, 0, and the fail state, 1: decision
-    states first where they share ids. End states, which Table 3 leaves out, have the ids after all others.
+    Missing ids are the next free ones after home, 0, and fail, 1: decision states first where they share ids. End
+    states, which Table 3 leaves out, come last.
 
     Args:
         source: the file, for messages.

@@ -50,8 +50,8 @@ class Task:
 
     Args:
         graph: shape of the tree, <b, d, p>.
-        goal: the branches that lead to the goal, d integers in 1..b, as ``"1.2"`` or (1, 2); afterwards a tuple. They
-            are the decisions to take, but for ``swapped_branches``.
+        goal: branches to the goal, d integers in 1..b, as ``"1.2"`` or (1, 2), kept as a tuple; the decisions to take,
+            but for ``swapped_branches``.
         observations: X.
         images: O.
         reward_fn: the share of ``goal_reward`` that each end state pays, g.
@@ -136,13 +136,12 @@ class Task:
 
     @classmethod
     def from_json(cls, path_or_dict: str | PathLike[str] | Mapping[str, Any], goal: Goal | None = None) -> Self:
-        """The task of a configuration file: of the paper's Table 3, or of the authors' implementation.
+        """The task of a configuration file: of the paper's Table 3 (`ctgraph_rl.tasks.paper_json`), or of the authors'.
 
-        The parameters of Table 3 have the paper's meaning; see `ctgraph_rl.tasks.paper_json`. A file with a section
-        ``image_dataset`` is of the implementation, and the task behaves as it does there. Its keys may be those of 2019
-        (``delay_prob``), of 2021 (``wait_prob``) or of 2023 (``p``). Where such a file has ``stochastic_sampling``, the
-        standard deviation of rewards counts only if that is true. The ``general_seed`` or ``Seed`` is not of the task:
-        give it to ``CTGraphEnv(seed=...)``, whose random numbers are other ones.
+        A file with a section ``image_dataset`` is of the authors' implementation, with keys of 2019 (``delay_prob``),
+        2021 (``wait_prob``) or 2023 (``p``), and the task behaves as there. If it has ``stochastic_sampling``, the
+        standard deviation of rewards counts only where that is true. ``general_seed`` or ``Seed`` is not of the task:
+        give it to ``CTGraphEnv(seed=...)``, whose random numbers differ.
 
         Args:
             path_or_dict: the file, or its content.
@@ -150,24 +149,23 @@ class Task:
                 ``set_high_reward_path`` counts from 0: add 1.
 
         Raises:
-            ValueError: for a missing goal, a file that cannot be read, keys that are missing, unknown or of several
-                dialects, and values out of range, those that the authors' implementation silently repairs among them.
+            ValueError: for a missing goal, an unreadable file, keys that are missing, unknown or of several dialects,
+                and values out of range, also those that the authors' implementation silently repairs.
         """
         return cls(**reference.read_task(path_or_dict, goal))
 
     @takes_numbers
     def to_json(self, path: str | PathLike[str] | None = None, general_seed: int = 1) -> dict[str, Any]:
-        """This task as a configuration file of the authors' implementation, with the keys of 2023.
+        """This task as a file of the authors' implementation, with the keys of 2023; written to ``path`` if given.
 
         The file has no goal: call ``set_high_reward_path`` there with the decisions less 1, [1, 0] for the goal 2.1.
         ``Task.from_json(task.to_json(), goal=task.goal)`` equals every task that `from_json` made.
 
         Args:
-            path: where to write the file; None: nowhere.
+            path: must not exist.
             general_seed: seed of the authors' environment, in [0, 2**32).
 
         Returns:
-            The content of the file.
 
         Raises:
             ValueError: lists everything of the task that the file cannot express.
