@@ -1,4 +1,4 @@
-"""Multi-head networks: output layers for each task on a trunk that all tasks share."""
+"""Output layers for each task on a trunk that all tasks share."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 
 
 class Heads(TaskMethod):
-    """Each task has its own last linear layers of policy and critic; a new task starts with those of the new agent.
+    """Each task has separate last linear layers of policy and critic, at first the new agent's.
 
     Stored are their weights, 4 H bytes for each of the curriculum's tasks.
     """
@@ -33,7 +33,7 @@ class Heads(TaskMethod):
 
     @torch.no_grad()
     def start_task(self, task: int | None) -> None:
-        """Load the task's output layers, and clear the optimiser's state of them."""
+        """Load the task's output layers, and clear their optimiser state."""
         super().start_task(task)
         in_heads = self.in_heads.to(self.kept.device)
         weights = self.weights.vector()
@@ -48,7 +48,7 @@ class Heads(TaskMethod):
         self.kept[self.slot] = self.weights.vector()[self.in_heads.to(self.kept.device)]
 
     def slot_of(self, task: int) -> int:
-        """Return the slot of a task's output layers; before it starts, a free one, which has those of the new agent."""
+        """Return the slot of a task's output layers; before it starts, a free one with the new agent's."""
         unseen = task not in self.started and len(self.started) < self.num_tasks
         return len(self.started) if unseen else super().slot_of(task)
 

@@ -1,4 +1,4 @@
-"""The base classes of methods that hold weights near those of earlier tasks, in proportion to their importance."""
+"""The base classes of methods that hold weights near those of earlier tasks, by their importance."""
 
 from __future__ import annotations
 
@@ -25,14 +25,13 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 class Importance(Method):
     """Adds coeff * sum_i I_i (w_i - a_i)^2 to the losses: I are importances, a the weights of earlier tasks.
 
-    Stored are I, a and which weights are held, 12 P bytes in all, whatever the number of tasks; and in a multi-head
-    network the output layers, see `Heads`.
+    Stored are I, a and which weights are held, 12 P bytes in all, whatever the number of tasks; and the output layers
+    of multi-head networks (`Heads`).
 
     Args:
         coeff: weight of the penalty.
-        heads: ``single``: all tasks share the output layers, whose weights are held, too; ``multi``: each task has its
-            own, which are not held; ``auto``: multi where the protocol gives task ids and each block has one task,
-            else single.
+        heads: ``single``: all tasks share the output layers, which are held; ``multi``: each task has separate ones,
+            not held; ``auto``: multi where the protocol gives task ids and each block has one task, else single.
     """
 
     hidden_ids_hint = ", or method.heads=single"
@@ -79,7 +78,7 @@ class Importance(Method):
             self.heads.end_task()
 
     def task_importance(self) -> Tensor:
-        """Compute how important the weights are for the task that ends, float32 [P], each >= 0."""
+        """Return the weights' importance for the ending task, float32 [P], each >= 0."""
         raise NotImplementedError
 
     def consolidate(self, new: Tensor, weights: Tensor) -> None:
@@ -93,25 +92,25 @@ class Importance(Method):
         return {"loss_method": self.coeff * (self.importance * gap.square()).sum()}
 
     def task_weights(self, task: int) -> Tensor | None:
-        """Return the present weights with the task's own output layers."""
+        """Return the present weights with the task's output layers."""
         return None if self.heads is None else self.heads.task_weights(task)
 
 
 def num_learnt(data: Data) -> int:
-    """Return how many frames are learned from; sequences of recurrent Q-learners have others, too."""
+    """Return how many frames are learned from, which excludes some of recurrent Q-learners' sequences."""
     return data["action"].numel() if "learnt" not in data else int(data["learnt"].sum())
 
 
 def learnt_steps(outputs: Tensor, data: Data) -> Tensor:
-    """Select the outputs of the steps that are learned from, [steps, n], from those of all, [..., n]."""
+    """Select the outputs of the steps that are learned from, [steps, n], from all, [..., n]."""
     return outputs.flatten(0, -2) if "learnt" not in data else outputs[data["learnt"]]
 
 
 class Samples:
-    """The last minibatches that were learned from, of the first pass over each batch only.
+    """The last minibatches of the first pass over each batch.
 
     Args:
-        num_frames: the least number of frames that they have in all.
+        num_frames: least number of their frames.
     """
 
     def __init__(self, num_frames: int) -> None:
@@ -119,12 +118,12 @@ class Samples:
         self.num_frames = num_frames
         self.num_held = 0
         self.remaining = math.inf
-        """Frames of the present batch's first pass that are still to come."""
+        """Frames still to come in the present batch's first pass."""
 
         self.minibatches: deque[Items] = deque()
 
     def add(self, minibatch: Data) -> None:
-        """Add a minibatch of the first pass, and drop those that are no longer needed."""
+        """Add a minibatch of the first pass, and drop old ones."""
         size = num_learnt(minibatch)
         if self.remaining <= 0:
             return
@@ -141,7 +140,7 @@ class Samples:
         self.num_held = 0
 
     def items(self) -> Iterator[Items]:
-        """Yield the items of the minibatches one by one, [1, ...], the latest first, until there are enough frames."""
+        """Yield single items, [1, ...], the latest first, until there are enough frames."""
         frames = 0
         for minibatch in reversed(self.minibatches):
             for number in range(len(minibatch["action"])):
@@ -152,7 +151,7 @@ class Samples:
                 yield item
 
     def state(self) -> NamedValues:
-        """Return plain values for a state dict."""
+        """Return a state of plain values."""
         alike = groupby(self.minibatches, lambda minibatch: (minibatch["action"].shape[1:], [*minibatch]))
         return {"parts": [_joined(list(minibatches)) for _, minibatches in alike]}
 
@@ -166,19 +165,19 @@ class Samples:
 
 
 def _joined(minibatches: Sequence[Items]) -> NamedValues:
-    """Concatenate minibatches of items of one shape, and return them with their sizes."""
+    """Return concatenated minibatches of items of one shape, with their sizes."""
     items = {key: torch.cat([minibatch[key] for minibatch in minibatches]) for key in minibatches[0]}
     return {"sizes": [len(minibatch["action"]) for minibatch in minibatches], "items": items}
 
 
 class SampledImportance(Importance):
-    """`Importance` that is a mean over the frames that were learned from last.
+    """`Importance` that is a mean over the last learned frames.
 
-    Until a task ends, the last of its minibatches are stored, too, with at least ``num_samples`` frames in all.
+    Until a task ends, its last minibatches are stored.
 
     Args:
-        num_samples: number of these frames.
-        settings: the arguments of `Importance`.
+        num_samples: least number of these frames.
+        settings: arguments of `Importance`.
     """
 
     agent_members = (*Importance.agent_members, "num_learnt")
@@ -192,17 +191,17 @@ class SampledImportance(Importance):
         self.samples.remaining = self.agent.num_learnt(batch)
 
     def transform_minibatch(self, batch: Data) -> Data:
-        """Return the same minibatch, and keep it for the end of the task."""
+        """Keep the minibatch for the end of the task."""
         self.samples.add(batch)
         return batch
 
     def end_task(self) -> None:
-        """Compute the importances for the task, and drop its samples."""
+        """Set the importances for the task, and drop its samples."""
         super().end_task()
         self.samples.clear()
 
     def mean(self, terms: Callable[[Items], Iterator[Tensor]]) -> Tensor:
-        """Return the sum of the terms of all samples, [P] each, divided by the number of frames."""
+        """Return the sum of all samples' terms, [P] each, by the number of frames."""
         total = torch.zeros_like(self.importance)
         frames = 0
         for item in self.samples.items():
@@ -212,7 +211,7 @@ class SampledImportance(Importance):
         return total / max(frames, 1)
 
     def gradient(self, value: Tensor) -> Tensor:
-        """Compute the gradient of a scalar by the weights, [P]; its graph is retained."""
+        """Return the gradient of a scalar by the weights, [P]; its graph is retained."""
         return flat(torch.autograd.grad(value, self.weights.parameters, retain_graph=True, materialize_grads=True))
 
     @override

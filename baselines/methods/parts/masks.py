@@ -21,16 +21,16 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 class Masks(TaskMethod):
     """The weights are w = c * 1[s >= 0], elementwise: c is drawn once and fixed, the scores s of each task are learned.
 
-    c has the sign of the weights that the agent was built with and the size sqrt(2 / inputs of the layer); biases are
-    0. Initial scores are uniform in +-1 / sqrt(inputs), and their gradient is that of the mask (straight through):
-    dL/ds = c dL/dw. Classes that derive from it say how a new task's scores are initialised.
+    c has the sign of the agent's first weights and the size sqrt(2 / inputs of the layer); biases are 0. Initial scores
+    are uniform in +-1 / sqrt(inputs), and their gradient is that of the mask (straight through): dL/ds = c dL/dw.
+    Subclasses say how a new task's scores start.
 
-    Stored are c, the scores of each of the curriculum's tasks and those of the present one: 4 P bytes each; a mask
-    without scores could be kept in P bits.
+    Stored are c, the scores of each of the curriculum's tasks and the present ones: 4 P bytes each; a mask without
+    scores takes P bits.
 
     Args:
-        backbone_seed: c and the initial scores of each slot come from this seed, so that agents with different seeds
-            have the same ones and can use each other's masks; None: from the agent's own seed.
+        backbone_seed: of c and the initial scores of each slot, so that agents with different seeds share them and can
+            exchange masks; None: from the agent's seed.
     """
 
     stackable = True
@@ -58,7 +58,7 @@ class Masks(TaskMethod):
         rule = f"{type(self).__name__} masks weight matrices, and {', '.join(vectors)} are none"
         require((not vectors, f"{rule}: take another method, or a network without such layers"))
         self.ended = 0
-        """Number of tasks whose scores are stored."""
+        """Number of tasks with stored scores."""
 
         scores = weights.zeros().repeat(self.num_tasks, 1)
         own = self.initial_scores()
@@ -86,12 +86,12 @@ class Masks(TaskMethod):
         return [_drawn_scores(parameter).flatten() for parameter in self.weights.parameters]
 
     def current_scores(self) -> Sequence[Tensor]:
-        """Compute the scores of the present mask, float32 [n] of each weight tensor, from the trained parameters."""
+        """Return the present mask's scores, float32 [n] of each weight tensor, from the trained parameters."""
         return list(self.own)
 
     @torch.no_grad()
     def start_task(self, task: int | None) -> None:
-        """Initialise a new task's scores, or load those of a task that returns."""
+        """Initialise a new task's scores, or load those of a returning task."""
         super().start_task(task)
         if self.slot < self.ended:
             self.set_scores(self.weights.split(self.scores[self.slot]))
@@ -107,7 +107,7 @@ class Masks(TaskMethod):
         self.set_scores(drawn if self.backbone_seed is None else self.weights.split(self.scores[self.slot]))
 
     def set_places(self, places: Sequence[int], excluded: int, device: torch.device) -> None:
-        """Set which b `combine` reads, the last one for the own scores, and exclude the last of the others."""
+        """Set which b `combine` reads, the last for the own scores, and exclude the last of the others."""
         none = [-torch.inf] * excluded
         offsets = [0.0] * (len(places) - excluded - 1) + none + [0.0]
         self.places = torch.tensor(places, device=device, dtype=torch.int64)
@@ -119,7 +119,7 @@ class Masks(TaskMethod):
         return list(map(combined, betas.unbind(-2), self.weights.split(others), self.own))
 
     def set_scores(self, scores: Sequence[Tensor]) -> None:
-        """Set the trained scores to these values."""
+        """Set the trained scores."""
         for own, value in zip(self.own, scores, strict=True):
             own.copy_(value)
 
@@ -132,7 +132,7 @@ class Masks(TaskMethod):
         self.ended = max(self.ended, self.slot + 1)
 
     def transform_gradients(self, gradients: Sequence[Tensor], weights: Sequence[Tensor]) -> Sequence[Tensor]:
-        """Compute the gradients of the trained parameters, through the scores."""
+        """Return the gradients of the trained parameters, through the scores."""
         with torch.enable_grad():
             scores = self.current_scores()
         constants = self.weights.split(self.constant)
@@ -154,13 +154,13 @@ class Masks(TaskMethod):
 
     @torch.no_grad()
     def scores_of(self, task: int) -> Tensor:
-        """Return a copy of the scores of a task that has started, float32 [P]; of the present one, its scores now."""
+        """Return a copy of a started task's scores, float32 [P]; of the present one, its scores now."""
         slot = self.started.index(task)
         return flat(self.current_scores()) if slot == self.slot else self.scores[slot].clone()
 
     @torch.no_grad()
     def take_scores(self, scores: Tensor) -> None:
-        """Replace the scores of the present task, [P]; the optimiser keeps its state."""
+        """Replace the present task's scores, [P]; the optimiser keeps its state."""
         self.set_scores(self.weights.split(scores))
         self._write()
         self.agent.weights_changed()
@@ -170,7 +170,7 @@ class Masks(TaskMethod):
 
 
 def zero_betas(weights: Weights, count: int) -> nn.Parameter:
-    """Return numbers b that are 0, so many of each weight tensor."""
+    """Return so many b of 0 for each weight tensor."""
     return nn.Parameter(torch.zeros(len(weights.parameters), count, dtype=torch.float32, device="cpu"))
 
 
@@ -179,7 +179,7 @@ def _masked(scores: Tensor, constant: Tensor) -> Tensor:
 
 
 def combined(betas: Tensor, old: Tensor, new: Tensor) -> Tensor:
-    """Combine earlier scores of a weight tensor, [..., k, n], with new ones, [..., n], by shares of a softmax."""
+    """Combine earlier scores of a weight tensor, [..., k, n], with new ones, [..., n], by softmax shares."""
     shares = betas.softmax(dim=-1)  # by the tensor: the compiler of torch 2.13 fails at eight numbers for all of them
     return (shares[..., :-1, None] * old).sum(dim=-2) + shares[..., -1:] * new
 
@@ -192,7 +192,7 @@ def _signed_constant(parameter: Tensor) -> Tensor:
 
 
 def _drawn_scores(parameter: Tensor) -> Tensor:
-    """Draw uniformly from +-1 / sqrt(inputs), and return 0 for biases."""
+    """Draw uniformly from +-1 / sqrt(inputs); biases are 0."""
     if parameter.ndim < 2:
         return torch.zeros_like(parameter)
     most = parameter[0].numel() ** -0.5

@@ -1,4 +1,4 @@
-"""The base class of masks that combine a selection of the earlier tasks, and what selects: embeddings of tasks."""
+"""The base class of masks that combine selected earlier tasks, and the embeddings of tasks."""
 
 from __future__ import annotations
 
@@ -29,24 +29,24 @@ from ctgraph_rl.tasks.kinds.task_like import TaskLike, most_actions
 EMBEDDINGS = ("lwe", "swe")
 
 STREAM = 0x5E1EC7
-"""Added to the agent's seed for what a selection draws, so that its own stream is untouched."""
+"""Added to the agent's seed for a selection's draws."""
 
 
 def own_generator(stream: int = STREAM) -> torch.Generator:
-    """Return a generator whose stream depends on the seed of torch's global one, from which nothing is drawn."""
+    """Return a generator whose stream depends on torch's global seed, without a draw from that."""
     return torch.Generator(device="cpu").manual_seed((torch.initial_seed() ^ stream << 32) % 2**63)
 
 
 class TaskEmbeddings(TakesNumbers):
     """A moving average of the embeddings of samples for each task, by slot.
 
-    After each batch ``num_samples`` of the last ``buffer_size`` transitions of the present task are drawn without
-    replacement, and embedded in a direction e; the task's embedding is z <- norm(z / 2 + e / 2), e at first.
+    After each batch ``num_samples`` of the task's last ``buffer_size`` transitions are drawn without replacement, and
+    embedded in a direction e; the task's embedding is z <- norm(z / 2 + e / 2), e at first.
 
     Args:
         embedding: ``lwe``, linear Wasserstein, or ``swe``, sliced Wasserstein.
         num_samples: N.
-        buffer_size: transitions that are kept; at least N.
+        buffer_size: stored transitions; at least N.
         num_references: M, of ``lwe``.
         num_directions: L, of ``swe``.
         num_quantiles: along each direction, of ``swe``.
@@ -78,7 +78,7 @@ class TaskEmbeddings(TakesNumbers):
         """Embeddings of norm 1, float32 [Z]."""
 
         self.recent: dict[str, Tensor] = {}
-        """The last transitions of the present task, [n, ...] each."""
+        """The present task's last transitions, [n, ...] each."""
 
     def start_task(self) -> None:
         """Empty the buffer."""
@@ -89,7 +89,7 @@ class TaskEmbeddings(TakesNumbers):
         self.recent = with_last(self.recent, batch, self.buffer_size)
 
     def update(self, slot: int, num_actions: int, generator: torch.Generator) -> None:
-        """Update the embedding of the present task, if there are enough transitions."""
+        """Update the present task's embedding, if there are enough transitions."""
         if len(self.recent["action"]) < self.num_samples:
             return
         points = sampled_points(self.recent, self.num_samples, num_actions, generator)
@@ -115,15 +115,15 @@ class TaskEmbeddings(TakesNumbers):
 class SelectedMasks(MaskLC):
     """`MaskLC` that combines the new scores with those of selected earlier tasks; the others have a share of 0.
 
-    s = sum_i a_i s_i + a_k s_k over the selected tasks i, where a is the softmax of their b and the new scores' b. The
-    b of a task that is not selected is kept for when it is. When a task starts none is selected.
+    s = sum_i a_i s_i + a_k s_k over the selected tasks i, where a is the softmax of their b and the new scores' b. A
+    task that is not selected keeps its b. A task starts with none selected.
 
     Beside what `MaskLC` stores: copies of the selected tasks' scores, 4 P bytes each; an embedding of each task, 4 M n
     bytes (``lwe``, n = pixels + actions + 1) or 4 L Q (``swe``); the last transitions.
 
     Args:
         every: batches between two selections.
-        embedding: the arguments of `TaskEmbeddings`.
+        embedding: arguments of `TaskEmbeddings`.
     """
 
     Settings = TaskEmbeddings
@@ -203,7 +203,7 @@ class SelectedMasks(MaskLC):
         return self.combine(self.community)
 
     def _gather(self, slots: list[int]) -> None:
-        """Copy the scores of the selected tasks; some others fill up to 4, 16, 64 ..., as each number is compiled."""
+        """Copy the selected tasks' scores, filled up to 4, 16, 64 ..., as each number is compiled."""
         room = 4
         while room < len(slots):
             room *= 4
@@ -214,7 +214,7 @@ class SelectedMasks(MaskLC):
         self.set_places([*filled, self.slot], len(filled) - len(slots), self.scores.device)
 
     def get_extra_state(self) -> NamedValues:
-        """Return what is selected, and all that selections depend on."""
+        """Return the selection and all that it depends on."""
         counts = {"selected": self.selected, "num_batches": self.num_batches, "random": self.generator.get_state()}
         return {**super().get_extra_state(), **counts, "embeddings": self.embeddings.state()}
 

@@ -30,12 +30,12 @@ from ctgraph_rl.tasks.protocol import Block, Protocol
 class SelfLabelled:
     """A method whose task ids and boundaries come from a detector.
 
-    The method starts and ends tasks as if the labels were ids of tasks that are given at announced boundaries. With the
-    oracle and announced boundaries that is ``protocol.task_id=at_boundaries``, bit for bit.
+    Labels start and end tasks as ids at announced boundaries do. With the oracle and announced boundaries this is
+    ``protocol.task_id=at_boundaries``, bit for bit.
 
     Args:
         method: any lifelong-learning method that learns the curriculum unchanged.
-        detector: what gives the labels.
+        detector: gives the labels.
     """
 
     def __init__(self, method: MethodLike, detector: Judge) -> None:
@@ -87,11 +87,11 @@ class SelfLabelled:
         return len(curriculum.tasks) if most is None else most
 
     def attach(self, agent: Agent, curriculum: Curriculum) -> SelfLabelledAgent:
-        """Return the agent with the method attached, whose tasks the detector labels.
+        """Return the agent with the method, whose tasks the detector labels.
 
         Args:
             agent: a new agent.
-            curriculum: what `prepare` returned.
+            curriculum: from `prepare`.
 
         Raises:
             ValueError: if agent, method and detector do not fit together.
@@ -123,7 +123,7 @@ class SelfLabelled:
 
 
 def as_labelled(curriculum: Curriculum) -> Curriculum:
-    """Return the curriculum as a method with labels sees it: each task in a block, announced with its id."""
+    """Return the curriculum with each task in a block, announced with its id."""
     blocks = tuple(Block((task,), curriculum.num_frames) for task in curriculum.tasks)
     return replace(curriculum, blocks=blocks, protocol=Protocol("at_boundaries", "announced"))
 
@@ -131,21 +131,20 @@ def as_labelled(curriculum: Curriculum) -> Curriculum:
 class SelfLabelledAgent(nn.Module):
     """An agent with a method, whose tasks a detector labels.
 
-    At a suspicion the older of two snapshots of agent, optimiser and method is restored, and the task ends there. Then
-    the known labels start one after the other, in the order in which they were opened, for `Judge.patience` frames
-    each; nothing is learned meanwhile. If the detector accepts none, a new label starts; where there are `max_labels`
-    already, that of before the suspicion resumes. If the label of before is accepted, there was no boundary: what is
-    learned is as the snapshot was.
+    A suspicion restores the older of two snapshots of agent, optimiser and method and ends the task. Then the known
+    labels start in the order of their opening, for `Judge.patience` frames each, without learning. If the detector
+    accepts none, a new label starts, or the old one resumes if there are `max_labels`. If it accepts the old label,
+    there was no boundary, and the snapshot stays.
 
     Args:
         learner: the agent with its method.
-        detector: what gives the labels.
+        detector: gives the labels.
         policy: of the agent, which computes features.
         max_labels: most labels.
     """
 
     events = ("alarm", "rolled_back")
-    """What it measures at the end of a batch."""
+    """Measurements of a batch's end."""
 
     def __init__(self, learner: Agent, detector: Judge, policy: nn.Module, max_labels: int) -> None:
         super().__init__()
@@ -156,24 +155,24 @@ class SelfLabelledAgent(nn.Module):
         self.num_steps = learner.num_steps
         object.__setattr__(self, "_trunk", trunk_of(policy))  # a part of the agent, which holds it
         self.label = 0
-        """The label that acts, and unless labels are tried learns."""
+        """The label that acts, and learns unless labels are tried."""
 
         self.num_labels = 0
         self.home: int | None = None
         """The label before the suspicion, while labels are tried."""
 
         self.waiting: list[int] = []
-        """The labels that are still to be tried."""
+        """The labels still to be tried."""
 
         self.num_tried = 0
-        """Frames that the present label has been tried."""
+        """Frames of the present label's trial."""
 
         self.snapshots: list[NamedValues] = []
-        """The older one first; each with ``state`` and ``frames``, those learned from until the next one."""
+        """The older one first; each with ``state`` and ``frames``, those learned until the next one."""
 
     @property
     def policy(self) -> TensorDictModuleBase:
-        """The agent's policy, with the weights of the label that acts."""
+        """The agent's policy with the acting label's weights."""
         return self.learner.policy
 
     @property
@@ -186,7 +185,7 @@ class SelfLabelledAgent(nn.Module):
         return self.learner.policy_for(task)
 
     def policy_for_label(self, label: int | None) -> TensorDictModuleBase:
-        """Return the policy for a label; for None that for a label that has not been opened."""
+        """Return the policy for a label; for None that for an unopened label."""
         return self.policy_for(self.num_labels if label is None else label)
 
     def initial_state(self, num_envs: int) -> TensorDict:
@@ -194,25 +193,25 @@ class SelfLabelledAgent(nn.Module):
         return self.learner.initial_state(num_envs)
 
     def start_task(self, task: int | None = None) -> None:
-        """Start the label that the detector begins with; the oracle says another at each announced boundary."""
+        """Start the detector's first label, or the oracle's at each announced boundary."""
         self._start(self.detector.present_label())
 
     def end_task(self) -> None:
-        """End the task of the present label."""
+        """End the present label's task."""
         if self.home is None:
             self.learner.end_task()
 
     def loss(self, batch: Mapping[Any, Tensor] | TensorDictBase) -> Mapping[str, Tensor] | TensorDictBase:
-        """Compute the agent's losses and the method's penalties."""
+        """Return the agent's losses and the method's penalties."""
         return self.learner.loss(batch)
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Ask the detector, and learn from a batch unless it suspects a change or labels are tried.
 
         Returns:
-            What the agent measured, if it learned; ``acted_label``, from 1, that acted in the batch; ``learned``, 1 or
-            0; ``alarm``, 1 where the detector left the label that was learned, or 0; ``rolled_back``, the number of
-            earlier frames whose learning was undone; ``oracle``, 1, where the detector knows the true tasks.
+            The agent's measurements, if it learned; ``acted_label``, from 1; ``learned``, 1 or 0; ``alarm``, 1 where
+            the detector left the learned label, or 0; ``rolled_back``, the earlier frames whose learning was undone;
+            ``oracle``, 1, where the detector knows the true tasks.
         """
         verdict = self.detector.observe(self._seen(batch))
         measured: dict[str, float] = {"acted_label": self.label + 1, "learned": 0, "alarm": 0, "rolled_back": 0}
@@ -237,7 +236,6 @@ class SelfLabelledAgent(nn.Module):
 
     @torch.no_grad()
     def _seen(self, batch: TensorDictBase) -> Seen:
-        """Return what the detector sees of a batch."""
         after = batch["next"]
         needs = self.detector.needs
         given = {
@@ -255,12 +253,11 @@ class SelfLabelledAgent(nn.Module):
         return Seen(**{key: value.detach().cpu() for key, value in given.items()})
 
     def _start(self, label: int) -> None:
-        """Start to learn a label."""
         self.learner.start_task(label)
         self._resume(label)
 
     def _resume(self, label: int) -> None:
-        """Learn the label that has started."""
+        """Learn the started label."""
         self.label = label
         self.num_labels = max(self.num_labels, label + 1)
         self.home = None
@@ -271,11 +268,11 @@ class SelfLabelledAgent(nn.Module):
             self._take_snapshot()
 
     def _take_snapshot(self) -> None:
-        """Keep what is learned now, and the newer of the snapshots so far."""
+        """Take a snapshot, and keep the newer of the earlier ones."""
         self.snapshots = [*self.snapshots[-1:], {"state": deepcopy(self.learner.state_dict()), "frames": 0}]
 
     def _learned(self, num_frames: int) -> None:
-        """Count frames that were learned from, and take a snapshot where it is time."""
+        """Count learned frames, and take a snapshot if due."""
         if self.snapshots:
             self.snapshots[-1]["frames"] += num_frames
             if self.snapshots[-1]["frames"] >= cast(int, self.detector.snapshot_every):
@@ -293,7 +290,7 @@ class SelfLabelledAgent(nn.Module):
         return undone
 
     def _restore(self) -> None:
-        """Restore what was learned at the older snapshot, if there is one."""
+        """Restore the older snapshot, if there is one."""
         for snapshot in self.snapshots[:1]:
             self.learner.load_state_dict(deepcopy(snapshot["state"]))
 

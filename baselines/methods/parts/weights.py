@@ -1,4 +1,4 @@
-"""The weights of an agent's network as one vector, which most methods are written in."""
+"""The weights of an agent's network as one vector."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Weights:
     """The parameters that an agent learns, P numbers in all.
 
     Args:
-        policy: the module that acts, which has all of the parameters.
+        policy: the acting module, which has all of the parameters.
         parameters: those by which the agent's losses are differentiated.
 
     Raises:
@@ -45,15 +45,15 @@ class Weights:
         return self.parameters[0].device
 
     def zeros(self, dtype: torch.dtype = torch.float32) -> Tensor:
-        """Return a zero for each number, [P] on the CPU."""
+        """Return zeros, [P], on the CPU."""
         return torch.zeros(len(self), dtype=dtype, device="cpu")
 
     def vector(self) -> Tensor:
-        """Return a copy of all values, float32 [P]; gradients flow back to the parameters."""
+        """Return all values, float32 [P]; gradients flow back to the parameters."""
         return flat(self.parameters)
 
     def write(self, vector: Tensor) -> None:
-        """Set the parameters to the values of a vector, [P]."""
+        """Set the parameters to a vector, [P]."""
         write_flat(vector, self.parameters)
 
     def split(self, vector: Tensor) -> Sequence[Tensor]:
@@ -61,12 +61,12 @@ class Weights:
         return vector.split(self.sizes, dim=-1)
 
     def mask_of(self, names: Collection[str]) -> Tensor:
-        """Return bool [P], true in the parameters with these names."""
+        """Return where the parameters with these names are, bool [P]."""
         return flat([torch.full_like(value, name in names, dtype=torch.bool) for name, value in self.named])
 
     @property
     def in_heads(self) -> Tensor:
-        """bool [P], true in the output layers."""
+        """Where the output layers are, bool [P]."""
         return self.mask_of(self.head_names)
 
     @property
@@ -76,11 +76,11 @@ class Weights:
 
     @property
     def in_matrices(self) -> Tensor:
-        """bool [P], true in weight matrices and false in biases."""
+        """Where weight matrices are, not biases, bool [P]."""
         return self.mask_of([name for name, value in self.named if value.ndim > 1])
 
     def write_to(self, policy: TensorDictModuleBase, vector: Tensor) -> None:
-        """Set the weights of a copy of the policy to the values of a vector, [P]."""
+        """Set the weights of a copy of the policy to a vector, [P]."""
         parameters = dict(policy.named_parameters())
         write_flat(vector, [parameters[name] for name in self.names])
 
@@ -92,15 +92,13 @@ def flat(tensors: Sequence[Tensor]) -> Tensor:
 
 @torch.no_grad()
 def write_flat(vector: Tensor, tensors: Sequence[Tensor]) -> None:
-    """Set tensors to the values of a vector, as `flat` returns it of tensors like them."""
+    """Set tensors to the values of a vector made by `flat`."""
     for tensor, part in zip(tensors, vector.split([tensor.numel() for tensor in tensors]), strict=True):
         tensor.copy_(part.view_as(tensor))
 
 
 def head_names(policy: TensorDictModuleBase, without: str | None = None) -> list[str]:
-    """Return the names of the parameters of a policy's output layers.
-
-    These are the last linear layers of the modules behind the trunk.
+    """Return the names of the parameters of a policy's output layers, the last linear layers behind the trunk.
 
     Args:
         policy: the policy.
