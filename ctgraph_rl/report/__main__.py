@@ -1,4 +1,4 @@
-"""The command ``ctgraph-rl report``: a page of figures and tables of all runs."""
+"""The command ``ctgraph-rl report``: figures and tables of all runs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ctgraph_rl.report.terminal import print_problems, print_summary
 
 
 def main() -> None:
-    """Write the report, and say what is in it; the exit code is 1 if something was left out or is of different code."""
+    """Write the report, and say what is in it; the exit code is 1 if runs were left out or have different code."""
     parser = parsers.report()
     arguments = parser.parse_args()
     with refused_by(parser):

@@ -1,4 +1,4 @@
-"""What bounds the numbers of a curriculum's runs: the rewards of its tasks say it of returns, each metric of itself."""
+"""Bounds of the numbers of a curriculum's runs, from the rewards of its tasks and from each metric."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ ONE_EPISODE = Evaluation(num_episodes=1)
 
 @dataclass(frozen=True)
 class BoundsOfRuns:
-    """The bounds of what the runs of a curriculum measure, with the noise of rewards; infinite where nothing is known.
+    """Bounds of what a curriculum's runs measure, with the noise of rewards; infinite where unknown.
 
     Args:
         returns: of an evaluation of each task, by its label.
         known: what the metrics' bounds follow from.
         of_training: of the mean return of any number of episodes.
-        one_episode: whether all episodes of an evaluation are one: greedy ones of tasks without chance.
+        one_episode: whether all episodes of an evaluation are equal: greedy ones of tasks without chance.
     """
 
     returns: Mapping[str, Bounds] = field(default_factory=dict)
@@ -55,29 +55,29 @@ class BoundsOfRuns:
         return self.of_task(label).of_differences()
 
     def of_metric(self, name: str) -> Bounds:
-        """Of a metric; one of another version has none."""
+        """Of a metric; none for another version."""
         return Bounds(*METRICS[name].bounds(self.known)) if name in METRICS else UNBOUNDED
 
     def estimate(self, metric: str, values: Sequence[float | None]) -> Estimate:
-        """Return a metric over seeds: its mean with the interval of its bounds, or its exact value without one."""
+        """Return a metric over seeds: its mean with an interval, or an exact value without one."""
         if metric in METRICS and METRICS[metric].is_exact:
             return constant(values)
         return mean(values, bounds=self.of_metric(metric))
 
 
 NO_BOUNDS = BoundsOfRuns()
-"""Of runs of which nothing is known."""
+"""Of unknown runs."""
 
 
 def bounds_by_curriculum(runs: Sequence[Run]) -> dict[str, BoundsOfRuns]:
-    """Return the bounds of what the runs of each curriculum measure, by the curriculum's name in tables."""
+    """Return the bounds of each curriculum's runs, by its name in tables."""
     return {name: bounds_of(some) for name, some in by_curriculum(runs).items()}
 
 
 def bounds_of(runs: Iterable[Run]) -> BoundsOfRuns:
-    """Return the bounds of runs of one curriculum, from the first of them of which the curriculum is known.
+    """Return the bounds of runs of one curriculum, from the first whose curriculum is known.
 
-    Sums over time have those of the run with the most evaluations: the first one may be unfinished.
+    Sums over time use the run with the most evaluations, as others may be unfinished.
     """
     known = [run for run in runs if run.history is not None]
     curriculum = next(filter(None, map(curriculum_of, known)), None)
@@ -93,12 +93,12 @@ def bounds_of(runs: Iterable[Run]) -> BoundsOfRuns:
 def bounds_of_curriculum(curriculum: Curriculum, evaluations: int = 1) -> BoundsOfRuns:
     """Return the bounds of what runs of a curriculum measure.
 
-    Each task says what an episode can return, which bounds means of episodes. Bounds of the mean over all seeds,
-    such as the optimum, do not count.
+    Each task bounds an episode's return and so means of episodes. Bounds of the mean over all seeds, such as the
+    optimum, do not count.
 
     Args:
         curriculum: what they learn.
-        evaluations: of each task, after those before training; only those of sums over time need it.
+        evaluations: of each task, after those before training; needed for sums over time.
     """
     evaluation = curriculum.evaluation
     tasks = (*curriculum.tasks, *evaluation.held_out)
@@ -130,7 +130,7 @@ def _around(bounds: Sequence[Bounds]) -> Bounds:
 
 
 def _shares(tasks: Sequence[TaskLike], returns: Sequence[Bounds]) -> Bounds:
-    """Return the bounds of (return - failure) / (optimum - failure) of any task; infinite where these are not known."""
+    """Return the bounds of any task's (return - failure) / (optimum - failure); infinite where unknown."""
     failures = lowest_returns(tasks)
     optima = optimal_values(tasks)
     if isinstance(failures, Undefined) or isinstance(optima, Undefined):
@@ -145,7 +145,7 @@ def _shares(tasks: Sequence[TaskLike], returns: Sequence[Bounds]) -> Bounds:
 
 
 def curriculum_of(run: Run) -> Curriculum | None:
-    """Return what a run learned, from its directory or the published one; None where neither has its fingerprint."""
+    """Return what a run learned, from its directory or published; None without an equal fingerprint."""
     found: Curriculum | None
     try:
         found = Curriculum.from_json(run.path / CURRICULUM)
@@ -156,7 +156,7 @@ def curriculum_of(run: Run) -> Curriculum | None:
 
 @cache
 def published(name: str) -> Curriculum | None:
-    """Return the published curriculum of a name; None if there is none."""
+    """Return the published curriculum of a name, if any."""
     try:
         return curriculum_named(name)
     except ValueError:

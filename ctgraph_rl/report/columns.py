@@ -1,4 +1,4 @@
-"""The metrics that tables show of a curriculum: of a run, a sweep, a report, a paper and the board alike."""
+"""The metrics that all tables show of a curriculum."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ctgraph_rl.runs.read import Run, by_curriculum, histories
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 IN_ORDER = tuple(metric.__name__ for metric in metrics.SUMMARY)
-"""Metrics of tasks that are each trained once, one after the other."""
+"""Metrics of tasks that are trained once each, in order."""
 
 TRANSFER = ("forward_transfer", "backward_transfer")
 
@@ -25,13 +25,13 @@ WHERE_KNOWN = (
 
 
 def columns(trained: Trained, adapts: bool) -> tuple[str, ...]:
-    """Return the metrics that a table shows of a curriculum whether or not they have a value.
+    """Return the metrics that a table shows of a curriculum with or without a value.
 
     Transfer and forgetting need several blocks. Where each trains one task, and each task comes once, they are those of
-    `IN_ORDER`; else forgetting is `relative_forgetting`, and `regain` stands beside it where a task returns.
+    `IN_ORDER`; else forgetting is `relative_forgetting`, with `regain` where a task returns.
 
     Args:
-        trained: for each block, its tasks; empty where a log does not say it.
+        trained: for each block, its tasks; empty where unknown.
         adapts: whether rows adapt before they are evaluated.
     """
     tasks = [task for block in trained for task in set(block)]
@@ -49,7 +49,7 @@ def columns(trained: Trained, adapts: bool) -> tuple[str, ...]:
 
 
 def board_columns(curriculum: Curriculum) -> list[str]:
-    """Return `columns` of a curriculum without transfer, and without times, whose means leave out what never ended."""
+    """Return `columns` without transfer and times, whose means leave out what never ended."""
     shown = columns(curriculum.trained, curriculum.evaluation.adapt_episodes > 0)
     return [name for name in shown if name not in TRANSFER and not METRICS[name].is_time]
 

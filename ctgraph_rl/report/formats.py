@@ -1,4 +1,4 @@
-"""Tables of measures for readers: text for a terminal, Markdown and LaTeX, and agents by measures for a report."""
+"""Tables of measures for readers, as text, Markdown and LaTeX."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     from ctgraph_rl.report.results import Row
 
 NO_RUN_FINISHED = "every_metric"
-"""The measure of the only row of an agent none of whose runs finished."""
+"""The measure of an agent's only row if none of its runs finished."""
 
 Modified = Mapping[str, str]
-"""What differs from the published curriculum, by the name of a modified one; see `ctgraph_rl.report.names`."""
+"""What differs from the published curriculum, by the name of a modified one."""
 
 NOT_MODIFIED: Modified = {}
 
@@ -45,7 +45,7 @@ WHY_EXACT = (
 
 
 def text(rows: Sequence[Row], modified: Modified = NOT_MODIFIED, legend: str = LEGEND) -> str:
-    """Return the table for a terminal: under each curriculum and agent a line for each measure."""
+    """Return the table for a terminal: a line for each measure of each curriculum and agent."""
     head = textwrap.fill(legend, WIDTH)
     if legend == LEGEND:
         head += "\n" + textwrap.fill(WHY_EXACT, WIDTH)
@@ -69,12 +69,12 @@ def markdown(rows: Sequence[Row], modified: Modified = NOT_MODIFIED, legend: str
 
 
 def latex(rows: Sequence[Row], modified: Modified = NOT_MODIFIED, legend: str = LEGEND) -> str:
-    """Return a table of agents and measures in LaTeX for each curriculum; see `ctgraph_rl.report.latex`."""
+    """Return a table of agents and measures for each curriculum, by `ctgraph_rl.report.latex`."""
     return document(matrices(rows, modified, legend))
 
 
 def matrices(rows: Sequence[Row], modified: Modified = NOT_MODIFIED, legend: str = LEGEND) -> Iterator[Table]:
-    """Return the table of agents and measures of each curriculum; the first column is the agents' number of seeds."""
+    """Return each curriculum's table of agents and measures; the first column has the numbers of seeds."""
     for curriculum, its in split_by(rows, lambda row: row.curriculum).items():
         notes = _notes(its)
         measures = split_by(its, lambda row: row.measure)
@@ -98,7 +98,7 @@ def _notes(rows: Sequence[Row]) -> list[str]:
 
 
 def measure_name(measure: str) -> str:
-    """Return the one name of a measure for readers, such as ``average performance``."""
+    """Return a measure's name for readers, such as ``average performance``."""
     return measure.replace("_", " ")
 
 
@@ -121,7 +121,7 @@ class Line(NamedTuple):
 
 
 class Page(NamedTuple):
-    """The lines of a curriculum, and their notes in the order of their numbers."""
+    """The lines of a curriculum, and their notes by number."""
 
     curriculum: str
     lines: list[Line]
@@ -129,7 +129,7 @@ class Page(NamedTuple):
 
 
 def pages(rows: Sequence[Row]) -> Iterator[Page]:
-    """The rows in the form that is shown, for each curriculum."""
+    """Yield the shown rows of each curriculum."""
     for curriculum, its in split_by(rows, lambda row: row.curriculum).items():
         notes = _notes(its)
         lines = []

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class FrameRow(NamedTuple):
-    """A row of `results`: the run, and one number of it."""
+    """A row of `results`: a run, and one of its numbers."""
 
     run: str
     agent: str
@@ -48,7 +48,7 @@ DTYPES = {
 
 
 def results(paths: Path | str | Sequence[Path | str]) -> pandas.DataFrame:
-    """Return every number of finished runs as one tidy table, a row each.
+    """Return every number of finished runs as a row of one tidy table.
 
     The columns are:
 
@@ -60,15 +60,15 @@ def results(paths: Path | str | Sequence[Path | str]) -> pandas.DataFrame:
     - ``frames``: Int64, learned so far; ``episode``: Int64, of a row that adapts, from 1.
     - ``metric``: category; ``value``: float64, NaN where a metric is undefined.
 
-    Metrics of evaluations are ``return_mean`` and ``success_rate``. Those of training intervals begin with
-    ``training_`` and have no task, those of rows that adapt begin with ``adaptation_``. All others are of the whole
-    run, see ``docs/reference/metrics.md``, and have neither task nor block.
+    Metrics of evaluations are ``return_mean`` and ``success_rate``; those of training intervals begin with
+    ``training_`` and have no task, those of rows that adapt with ``adaptation_``. All others
+    (``docs/reference/metrics.md``) are of the whole run and have neither task nor block.
 
     Args:
-        paths: run directories, or folders that hold them. Single-task experts are left out where there are other runs.
+        paths: run directories, or folders that hold them. Single-task experts count only without other runs.
 
     Warns:
-        UserWarning: for each run that is left out: an unfinished or broken one, or a second copy.
+        UserWarning: for each run left out: unfinished, broken or a second copy.
 
     Raises:
         ModuleNotFoundError: without pandas; names the extra to install.

@@ -1,4 +1,4 @@
-"""Intervals of a mean and of a median, and the bounds of what they are of; `statistics` says which is for what."""
+"""Intervals of a mean and of a median, and bounds of values."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from ctgraph_rl.metrics.bounds import NOISE
 
 
 class Bounds(NamedTuple):
-    """The lowest and the highest value that a seed can have, infinite where it is not known.
+    """The lowest and highest value that a seed can have, infinite where unknown.
 
-    What bounds the mean over seeds, such as the optimum, bounds no seed: with it the interval would miss the mean.
+    Bounds of the mean over seeds, such as the optimum, bound no seed; with them the interval would miss the mean.
     """
 
     low: float
@@ -27,7 +27,7 @@ class Bounds(NamedTuple):
         """Return the bounds of values with normal noise; all but 1 of 15,000 values at a bound are within.
 
         Args:
-            noise: its standard deviation in a seed's value, such as ``reward_std`` over the root of the episodes.
+            noise: standard deviation in a seed's value, such as ``reward_std`` over the root of the episodes.
         """
         return Bounds(self.low - NOISE * noise, self.high + NOISE * noise)
 
@@ -39,20 +39,20 @@ class Bounds(NamedTuple):
 UNBOUNDED = Bounds(-math.inf, math.inf)
 
 ROUNDING = 1e-6
-"""By how much of its bounds a value may be outside of them: rewards are float32."""
+"""How far a value may exceed its bounds, as a share of them: rewards are float32."""
 
 SCALED_DIGITS = 12
-"""Digits of values that are scaled to bounds of 0 and 1: the last bits decide nothing."""
+"""Digits of scaled values: the last bits decide nothing."""
 
 GRID = 65
-"""Places at which a distribution is computed to find a quantile, `REFINEMENTS` times, closer and closer to it."""
+"""Places at which a distribution is computed to find a quantile, `REFINEMENTS` times."""
 
 REFINEMENTS = 3
 
 
 @cache
 def student(level: float, freedom: int) -> float:
-    """Half the width of Student's interval in standard errors; a report asks for it thousands of times."""
+    """Half the width of Student's interval in standard errors."""
     return float(scipy("stats").t.ppf((1 + level) / 2, freedom))
 
 
@@ -71,10 +71,10 @@ def gaffke(values: Sequence[float], bounds: Bounds, level: float) -> tuple[float
 
 @lru_cache(maxsize=2**16)
 def _least_mean(values: tuple[float, ...], tail: float) -> float:
-    """Return a quantile of the mean of values and one more 0, whose weights are uniform over all that sum to 1.
+    """Return a quantile of the mean of values and one more 0, with uniform weights that sum to 1.
 
-    Such a mean has the density of a B-spline whose knots are the values (Curry and Schoenberg 1966). For zeros and ones
-    it is a beta distribution, as of Clopper and Pearson.
+    The mean has the density of a B-spline with the values as knots (Curry and Schoenberg 1966). For zeros and ones it
+    is a beta distribution, as of Clopper and Pearson.
 
     Args:
         values: in [0, 1], rising.
@@ -100,7 +100,7 @@ def _least_mean(values: tuple[float, ...], tail: float) -> float:
 
 
 def within_bounds(known: Sequence[float], bounds: Bounds) -> bool:
-    """Return whether values are within bounds, rounding apart."""
+    """Return whether values are within bounds, but for rounding."""
     low, high = bounds
     slack = ROUNDING * max([1.0, *(abs(bound) for bound in (low, high) if math.isfinite(bound))])
     return all(low - slack <= value <= high + slack for value in known)
@@ -108,7 +108,7 @@ def within_bounds(known: Sequence[float], bounds: Bounds) -> bool:
 
 @cache
 def median_ranks(n: int, level: float) -> int:
-    """Return the largest k for which the k-th smallest and k-th largest of n values cover the median; 0 for none."""
+    """Return the largest k for which the k-th smallest and largest of n values cover the median; 0 for none."""
     tails = accumulate(math.comb(n, i) / 2**n for i in range((n + 1) // 2))
     return sum(tail <= (1 - level) / 2 for tail in tails)
 

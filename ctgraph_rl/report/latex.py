@@ -1,7 +1,7 @@
-"""Tables for papers: LaTeX with booktabs that stays within the margins of ``article``, with caption and label.
+"""Tables for papers: LaTeX with booktabs within the margins of ``article``, with caption and label.
 
-A cell is a value over its interval, and decimal points of a column are below each other. Wide tables have several
-parts, and long ones are several tables. A part that is still wider than a line is scaled down to it.
+A cell is a value over its interval, aligned at decimal points. Wide tables have several parts, long ones are several
+tables. A part that is still too wide is scaled down.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from ctgraph_rl.log.escape import latex_text
 PREAMBLE = r"% needs \usepackage{booktabs,graphicx}, and \usepackage[T1]{fontenc} for names with < or >"
 
 LINE_WIDTH = 345.0
-"""Points of a line of ``article`` with its usual letters of 10 points."""
+"""Points of a line of ``article`` in letters of 10 points."""
 
 COLUMN_SEPARATION = 8.0
 """Points between two columns."""
 
 LETTER = 5.2
-"""Points of a letter in a name, in letters of 8 points; those of a digit are 4.3."""
+"""Points of a letter in a name of 8 points; a digit has 4.3."""
 
 COLUMN = 58.0
-"""Points of a column of numbers: of its heading, broken into lines, and of an interval such as [-0.84, 0.84]."""
+"""Points of a column of numbers: its broken heading, and an interval such as [-0.84, 0.84]."""
 
 HEADING = 12
 """Characters of a heading's line."""
@@ -36,7 +36,7 @@ MOST_LINES = 40
 
 
 class TableCell(NamedTuple):
-    """A value with its interval, each as text, and the number of its note, from 1; 0 for none."""
+    """A value and its interval as text, and the number of its note, from 1; 0 for none."""
 
     value: str
     interval: str = ""
@@ -57,7 +57,7 @@ TableRows = Sequence[tuple[str, Sequence[TableCell]]]
 
 
 class Table(NamedTuple):
-    """A table: the heading of the first column, those of the others, rows, and notes."""
+    """The heading of the first column, those of the others, rows, and notes."""
 
     caption: str
     label: str
@@ -73,13 +73,13 @@ class Table(NamedTuple):
 
 
 def document(tables: Iterable[Table]) -> str:
-    """Return tables in LaTeX, each with its own label."""
+    """Return tables in LaTeX, each with a label."""
     labels = Labels()
     return "\n\n".join([PREAMBLE, *(latex(table._replace(label=labels.new(table.label))) for table in tables)])
 
 
 def latex(table: Table) -> str:
-    """Return a table in LaTeX, or several where it is long."""
+    """Return a table in LaTeX, or several if it is long."""
     widest = max([len(table.first), *(len(name) for name, _ in table.rows)])
     columns = max(2, int((LINE_WIDTH - LETTER * widest) // (COLUMN + COLUMN_SEPARATION)))
     starts = range(0, max(len(table.head), 1), columns)
@@ -128,25 +128,25 @@ def _heading(name: str) -> str:
 
 
 def signed(value: str) -> str:
-    """Return numbers with minus, plus-minus and infinity as formulas, and a dash for none."""
+    """Return minus, plus-minus and infinity as formulas, and a dash for none."""
     formula = value.replace("-", "$-$").replace("inf", r"$\infty$").replace("±", r"$\pm$")
     return "--" if value == "-" else formula
 
 
 def letters(number: int) -> str:
-    """Return the letters of a note, from 1: a to z, then aa; a number would be read as an exponent."""
+    """Return the letters of a note, from 1: a to z, then aa; numbers would look like exponents."""
     rest, last = divmod(number - 1, len(ascii_lowercase))
     return (letters(rest) if rest else "") + ascii_lowercase[last]
 
 
 class Labels:
-    """Gives every table of a document its own label."""
+    """Gives every table of a document a different label."""
 
     def __init__(self) -> None:
         self._taken: set[str] = set()
 
     def new(self, *names: str) -> str:
-        """Return a label of letters, digits and hyphens that was not given before."""
+        """Return a new label of letters, digits and hyphens."""
         stem = re.sub(r"[^a-z0-9]+", "-", "-".join(names).lower()).strip("-")
         label = stem
         version = 1

@@ -1,4 +1,4 @@
-"""Names of curricula and agents in tables and figures: what of a curriculum was modified, and names that are given."""
+"""Names of curricula and agents in tables and figures: modifications and given names."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ NOT_COMPARED = ("name", "source", "fingerprint", "schema", "about")
 """Keys of a curriculum's JSON that do not change what is learned."""
 
 MOST_CHANGES, MOST_VALUES = 6, 3
-"""Changes that are named, and different values of one that are."""
+"""Most changes that are named, and most values of one."""
 
 
 def modifications(runs: Sequence[Run]) -> dict[str, str]:
@@ -28,7 +28,7 @@ def modifications(runs: Sequence[Run]) -> dict[str, str]:
 
 
 def modification(run: Run) -> str:
-    """Return in words what of a run's curriculum differs from the published one; empty if that is unknown."""
+    """Return in words how a run's curriculum differs from the published one; empty if unknown."""
     if not run.curriculum[0].endswith(MODIFIED):
         return ""
     learned = curriculum_of(run)
@@ -47,7 +47,7 @@ def modification(run: Run) -> str:
 
 
 def _collect(value: Any, key: str, found: dict[str, list[Any]]) -> None:
-    """Add the values of nested JSON by dotted names, such as ``blocks.num_frames``; places in lists are left out."""
+    """Add values of nested JSON by dotted names, such as ``blocks.num_frames``, without places in lists."""
     if isinstance(value, Mapping):
         for name, inner in value.items():
             if key or name not in NOT_COMPARED:
@@ -66,14 +66,14 @@ def _shown(values: Iterable[Any] | None) -> str:
 
 
 def displayed(runs: Sequence[Run], agents: Sequence[str] = ()) -> list[Run]:
-    """Return runs with other names of their agents and in another order; agents that are not named follow.
+    """Return runs with other names of agents and in another order; agents that are not named follow.
 
     Args:
         runs: any runs.
-        agents: the agents in their order, each as its name in tables, or as ``NAME=SHOWN`` with the name to show.
+        agents: in order, each as its name in tables, or as ``NAME=SHOWN``.
 
     Raises:
-        ValueError: for an unknown agent, with the one that was probably meant, and for a name of two agents.
+        ValueError: for an unknown agent, with the likeliest one, and for a name of two agents.
     """
     known = _agents(runs)
     chosen: dict[str, str] = {}
@@ -100,7 +100,7 @@ def _agents(runs: Sequence[Run]) -> list[str]:
 
 
 def colours_of(runs: Sequence[Run], given: Sequence[str]) -> dict[str, str]:
-    """Return the colours of agents that are given as ``NAME=COLOUR``, by their names in tables and figures.
+    """Return the colours given as ``NAME=COLOUR``, by agents' names in tables and figures.
 
     Raises:
         ValueError: for an unknown agent, and for what has no colour.

@@ -1,4 +1,4 @@
-"""The metric that a run gives to a sweeper that searches for hyperparameters."""
+"""The metric that a run gives to a sweeper."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def check_objective(name: str | None, experts: bool) -> None:
     """Refuse an objective that a run cannot have.
 
     Args:
-        name: of a metric; None: there is no objective.
+        name: of a metric; None: no objective.
         experts: whether the run has experts.
 
     Raises:

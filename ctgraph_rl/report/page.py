@@ -1,4 +1,4 @@
-"""The report itself: one page of HTML that needs nothing else, the same in Markdown, and tables in LaTeX."""
+"""The report: one self-contained HTML page, the same in Markdown, and tables in LaTeX."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ OF_SECTION: tuple[Callable[[Section], CaptionedFigure | None], ...] = (
     *(mean_curves, learning_curves),
     *(training_curves, adaptation_curves, label_strips, profiles, improvements),
 )
-"""Figures of all agents on a curriculum, in their order; None where there is nothing to draw."""
+"""Figures of all agents on a curriculum, in order; None for nothing to draw."""
 
 OF_AGENT: tuple[Callable[[Section, Result, Trees], CaptionedFigure | None], ...] = (transfer_maps, task_trees)
-"""Figures of an agent with finished runs, in their order; None where there is nothing to draw."""
+"""Figures of an agent with finished runs, in order; None for nothing to draw."""
 
 MOST_ROWS = 2000
 """Rows up to which the table of every measure is shown."""
 
 MOST_SENTENCES = 10
-"""Seeds without results that are listed one by one."""
+"""Seeds without results that are listed."""
 
 MOST_COLUMNS = 10
-"""Tasks up to which a performance matrix is a table in LaTeX."""
+"""Tasks up to which LaTeX has the performance matrix."""
 
 
 TextRow = tuple[str, ...]
@@ -55,7 +55,7 @@ TextRow = tuple[str, ...]
 
 
 class Report(NamedTuple):
-    """The page that was written, its runs, and what could not be read."""
+    """The page, its runs, and what could not be read."""
 
     page: Path
     runs: list[Run]
@@ -101,10 +101,10 @@ def write_report(
         paths: run directories, or folders that hold them.
         folder: where the report goes; None: ``report`` within the one path, or, of several or a read-only one, within
             the working directory.
-        agents: names and order of agents, see `ctgraph_rl.report.names.displayed`.
+        agents: names and order of agents, as for `ctgraph_rl.report.names.displayed`.
         width: of figures: ``text`` of a page, or one of two columns, ``column``.
         colours: of agents, each as ``NAME=COLOUR``.
-        count: is called after each run that is read, each agent and each figure.
+        count: called after each run, agent and figure.
 
     Raises:
         ModuleNotFoundError: before any work, without what the extra ``report`` installs.
@@ -181,7 +181,7 @@ def _part(section: Section, gallery: Gallery) -> Part:
 
 
 def facts(section: Section) -> Iterator[tuple[str, Any]]:
-    """Return the facts of the curriculum that was learned."""
+    """Yield the facts of the learned curriculum."""
     about = section.one.about
     yield "curriculum", about["curriculum"]
     if section.modified:

@@ -31,7 +31,7 @@ from ctgraph_rl.report.terminal import print_note, print_problems
 from ctgraph_rl.runs.read import BySeed, Run, find_runs, grouped, present, why_left_out
 
 SOLVED = 0.9
-"""Success rate from which on a task counts as solved."""
+"""Success rate from which a task is solved."""
 
 _HERE = metrics.record.HERE
 AT_END = {
@@ -54,7 +54,7 @@ AT_END = {
         _HERE,
     ),
 }
-"""Measures of how tasks ended, by the first word of their name; the others are metrics of runs."""
+"""Measures of how tasks ended, by the first word of their name."""
 
 HEADER = (
     *("curriculum", "agent", "measure", "value", "low", "high", "n", "n_undefined", "method", "definition", "note"),
@@ -68,12 +68,12 @@ class Row:
 
     Args:
         curriculum: its name.
-        agent: the agent's class or name, and the settings in which it differs from others of that; or a directory.
+        agent: its class or name, with the settings that distinguish it; or a directory.
         measure: a metric, a measure of how tasks ended, or ``solved`` and a task.
         estimate: over seeds.
         definition: id of the metric's definition.
         note: why seeds have no value.
-        seed: of the run that it is of; None for all seeds.
+        seed: of one run; None for all seeds.
         columns: metrics that tables show of its curriculum.
     """
 
@@ -93,7 +93,7 @@ class Row:
 
     @property
     def shown(self) -> str:
-        """The agent, and the seed of a row of one run."""
+        """The agent, and the seed of a single run's row."""
         return self.agent if self.seed is None else f"{self.agent}, seed {self.seed}"
 
 
@@ -102,12 +102,12 @@ MeasureLine = tuple[str, Estimate, str, str]
 
 
 def table(runs: Sequence[Run], statistics: str = "exact", count: Count = silent) -> list[Row]:
-    """Every metric, and how tasks ended, for each agent on each curriculum.
+    """Return every metric, and how tasks ended, for each agent on each curriculum.
 
     Args:
         runs: finished or not.
         statistics: one of `ctgraph_rl.parsers.STATISTICS`.
-        count: is called after each agent on a curriculum.
+        count: called after each agent on a curriculum.
 
     Raises:
         ModuleNotFoundError: for several seeds without scipy.
@@ -126,7 +126,7 @@ def table(runs: Sequence[Run], statistics: str = "exact", count: Count = silent)
 
 
 def rows_by_seed(runs: Sequence[Run]) -> list[Row]:
-    """Every metric, and how tasks ended, of each run, without intervals."""
+    """Return every metric, and how tasks ended, of each run."""
     bounds = bounds_by_curriculum(runs)
     shown = columns_of_runs(runs)
     rows = []
@@ -141,7 +141,8 @@ def rows_by_seed(runs: Sequence[Run]) -> list[Row]:
 
 
 def comparisons(runs: Sequence[Run], metric: str) -> dict[tuple[str, str, str], Comparison]:
-    """Every pair of agents on the same curriculum and seeds, by (curriculum, first, second), with corrected p.
+    """Return the comparisons of every two agents on the same curriculum and seeds, by (curriculum, first, second), with
+    corrected p.
 
     Raises:
         ValueError: if no run has the metric.
@@ -163,13 +164,13 @@ def comparisons(runs: Sequence[Run], metric: str) -> dict[tuple[str, str, str], 
 
 
 def selected(rows: Sequence[Row], names: Sequence[str] | None = None, also: Sequence[str] = ()) -> list[Row]:
-    """The rows of some measures; agents none of whose runs finished stay.
+    """Return the rows of some measures; agents without a finished run stay.
 
     Args:
         rows: the whole table.
-        names: of measures, ``solved`` for all tasks' shares; None: those of the curriculum, the solved rate, and
-            `WHERE_KNOWN` where a run of the curriculum has a value.
-        also: measures that are shown with these.
+        names: of measures, ``solved`` for all tasks' shares; None: the curriculum's, the solved rate, and those of
+            `WHERE_KNOWN` with a value.
+        also: further measures.
 
     Raises:
         ValueError: for a name that no row has.
@@ -199,7 +200,7 @@ def _no_measure(unknown: Sequence[str], choices: Iterable[str]) -> str:
 
 
 def write_csv(path: Path | str, rows: Sequence[Row]) -> None:
-    """Write the table, empty cells for what is undefined; see `ctgraph_rl.log.escape.csv_text`."""
+    """Write the table as CSV, with empty cells for what is undefined."""
     lines: list[Sequence[Any]] = [HEADER]
     for row in rows:
         e = row.estimate
@@ -209,7 +210,7 @@ def write_csv(path: Path | str, rows: Sequence[Row]) -> None:
 
 
 def write_tidy(path: Path, runs: Sequence[Run]) -> None:
-    """Write every evaluation of runs as a row of one table, in CSV or Parquet by the ending of its name.
+    """Write every evaluation as a row of one table, in CSV or Parquet by the file's ending.
 
     Raises:
         ValueError: for another ending.
@@ -270,7 +271,7 @@ def _metric(by_seed: BySeed, name: str, bounds: BoundsOfRuns, kind: str) -> Esti
 
 
 def _over_seeds(values: Sequence[float | None], bounds: statistics.LowHigh, kind: str) -> Estimate:
-    """Return the values of seeds as one number, by one of `ctgraph_rl.parsers.STATISTICS`."""
+    """Return seeds' values as one number, by one of `ctgraph_rl.parsers.STATISTICS`."""
     if kind == "t":
         return mean(values)
     if kind == "std":

@@ -1,7 +1,6 @@
-"""Runs as the sections of a report: one for each curriculum, and in it an agent with all its seeds.
+"""Runs as the sections of a report: one for each curriculum, and in it each agent with all its seeds.
 
-Numbers of different curricula are never put together. A seed without results has no value in any estimate, and counts
-as one that is missing: n = 9/10.
+Numbers of different curricula are never put together. A seed without results counts as missing: n = 9/10.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ Estimates = list[list[Estimate]]
 
 
 FEWEST_FOR_BANDS = 10
-"""Seeds from which on bands of curves are intervals: with fewer, these would fill a panel."""
+"""Seeds from which bands of curves are intervals; those of fewer fill a panel."""
 
 
 class Point(NamedTuple):
@@ -59,17 +58,17 @@ class Result:
 
     @property
     def runs(self) -> list[Run]:
-        """All that there are, finished or not."""
+        """All runs, finished or not."""
         return present(self.by_seed)
 
     @property
     def finished(self) -> list[Run]:
-        """Those with results, by seed."""
+        """Runs with results, by seed."""
         return [run for run in self.runs if run.reason is None]
 
     @property
     def n(self) -> str:
-        """Seeds with results, as ``9/10`` where others have none."""
+        """Seeds with results, as ``9/10`` if others have none."""
         all_there = len(self.finished) == len(self.by_seed)
         return f"{len(self.finished)}" if all_there else f"{len(self.finished)}/{len(self.by_seed)}"
 
@@ -78,7 +77,7 @@ class Result:
         return self._over_seeds([each.performance for each in histories(self.finished)], self.bounds.of_task)
 
     def transfer(self) -> Estimates:
-        """Changes of each task by each block: differences of successive rows of the performance matrix."""
+        """Changes of each task by each block, between rows of the performance matrix."""
         changes = [np.diff(history.performance, axis=0).tolist() for history in histories(self.finished)]
         return self._over_seeds(changes, self.bounds.of_change)
 
@@ -100,10 +99,10 @@ class Section:
     """The results of all agents on a curriculum.
 
     Args:
-        name: the curriculum's, different from that of every other section.
+        name: the curriculum's, unique among sections.
         results: an agent each.
         rows: the table of measures.
-        modified: what differs from the published curriculum; empty for that itself.
+        modified: what differs from the published curriculum, if anything.
     """
 
     name: str
@@ -113,17 +112,17 @@ class Section:
 
     @property
     def runs(self) -> list[Run]:
-        """All that there are, finished or not."""
+        """All runs, finished or not."""
         return list(chain(*(result.runs for result in self.results)))
 
     @property
     def finished(self) -> list[Run]:
-        """Those with results."""
+        """Runs with results."""
         return [run for run in self.runs if run.reason is None]
 
     @cached_property
     def one(self) -> Run:
-        """The run that tells the section's facts: the first finished one, if there is one."""
+        """The run of the section's facts: the first finished one, if any."""
         return min(self.runs, key=lambda run: (run.reason is not None, run.history is None))
 
     @property
@@ -138,12 +137,12 @@ class Section:
 
     @cached_property
     def ends(self) -> tuple[int, ...]:
-        """Frames at the end of each block, 0 first; of a block that a run does not measure, as others say."""
+        """Frames at the end of each block, 0 first; other runs complete those that a run does not measure."""
         every = [history.ends for history in histories(self.runs)]
         return tuple(accumulate(map(max, zip_longest(*every, fillvalue=0)), max)) or (0,)
 
     def definitions(self) -> dict[str, tuple[str, str, str]]:
-        """Formula and source of each measure in the table, by the id of its definition."""
+        """Formula and source of each measure in the table, by id."""
         known = {each.id: (each.formula, each.source) for each in AT_END.values()}
         for run in self.runs:
             for metric in run.metrics.values():
@@ -156,7 +155,7 @@ class Section:
 
 
 def sections(runs: Sequence[Run], count: Count = silent) -> list[Section]:
-    """A section for each curriculum, in the order of the runs; counts agents on curricula."""
+    """Return a section for each curriculum, in the order of the runs."""
     agents: dict[str, list[Result]] = {}
     bounds = bounds_by_curriculum(runs)
     for (curriculum, agent), by_seed in grouped(runs).items():
@@ -172,7 +171,7 @@ def evaluation_curve(runs: Iterable[Run], label: str, bounds: Bounds = UNBOUNDED
 
 
 def mean_curve(history: History) -> Curve:
-    """Return the mean return over all tasks of a run, at the evaluations of all of them."""
+    """Return a run's mean return over all tasks, at evaluations of all."""
     curves = [dict(history.evaluations.get(label, [])) for label in history.labels]
     shared = sorted(set.intersection(*map(set, curves))) if curves else []
     return [(frames, fmean(curve[frames] for curve in curves)) for frames in shared]
@@ -181,7 +180,7 @@ def mean_curve(history: History) -> Curve:
 def training_curve(
     runs: Iterable[Run], block: int, *, start: int, end: int, places: int, bounds: Bounds = UNBOUNDED
 ) -> list[Point]:
-    """Return while training in a block, as means over equal spans of frames in which every run has a value.
+    """Return while training in a block: means over equal spans of frames in which every run has a value.
 
     Args:
         runs: of one agent.
@@ -202,7 +201,7 @@ def training_curve(
 
 
 def over_seeds(curves: Sequence[Curve], bounds: Bounds = UNBOUNDED) -> list[Point]:
-    """Means over curves, with their bands, where all have a value."""
+    """Means over curves where all have a value, with bands."""
     values: dict[int, list[float]] = {}
     for curve in curves:
         for frames, value in dict(curve).items():

@@ -4,11 +4,11 @@ There is one rule for each kind of number; ``docs/explanation/statistics.md`` ha
 
 - A share, and a mean of values with known bounds: Gaffke's interval. It assumes no distribution, stays within the
   bounds, and is that of Clopper and Pearson for two outcomes at the bounds.
-- A mean of values without two known bounds: Student's interval, cut at a bound that is known.
+- A mean of values without two known bounds: Student's interval, cut at a known bound.
 - A time: the interval of the median by order statistics, where a seed that never got there took infinitely long.
 
-Other papers show `mean` without bounds (Student's interval), `mean_and_std` and `iqm`, the interquartile mean of
-rliable. A seed without a value is counted, never replaced. Quantiles are scipy's: ``pip install 'ctgraph_rl[stats]'``.
+Other papers show `mean` without bounds (Student's interval), `mean_and_std` and `iqm`, rliable's interquartile mean. A
+seed without a value is counted, never replaced. Quantiles are scipy's: ``pip install 'ctgraph_rl[stats]'``.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ ROUNDING = 1e-12
 """Sums that differ by less are equal."""
 
 EQUAL_SEEDS = "all seeds are equal; few seeds leave other means possible, and the interval shows which"
-"""Why an interval has a width though no two seeds differ."""
+"""Why an interval has a width though all seeds are equal."""
 
 MOST_SEEDS = 2**20
-"""Number of seeds at which `seeds_needed` gives up."""
+"""Seeds at which `seeds_needed` gives up."""
 
 
 Values = Sequence[float | None]
 LowHigh = tuple[float, float] | Bounds
-"""Lowest and highest possible value; infinite where it is not known."""
+"""Lowest and highest possible value; infinite where unknown."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Estimate:
 
     Args:
         value: None without enough seeds.
-        low: lower end of the interval; None without one.
+        low: lower end of the interval, if any.
         high: upper end.
         n: seeds with a value.
         n_undefined: seeds without one.
@@ -66,7 +66,7 @@ class Estimate:
         std: standard deviation over seeds, shown in place of an interval.
 
     Raises:
-        ValueError: for an interval without a value, with one end, or that its value is outside of.
+        ValueError: for an interval without a value, with one end, or that excludes its value.
     """
 
     value: float | None
@@ -91,7 +91,7 @@ class Estimate:
 
     @property
     def shown(self) -> str:
-        """The value, with its interval or its standard deviation."""
+        """The value, with its interval or standard deviation."""
         value = "-" if self.value is None else f"{self.value:z.2f}"
         if self.std is not None:
             return f"{value} ± {self.std:.2f}"
@@ -99,7 +99,7 @@ class Estimate:
 
     @property
     def seeds(self) -> str:
-        """The number of seeds with a value, and of all where some have none."""
+        """The seeds with a value, and all if some have none."""
         return f"{self.n}/{self.n + self.n_undefined}" if self.n_undefined else f"{self.n}"
 
 
@@ -110,13 +110,13 @@ class Comparison:
     Args:
         difference: mean of first minus second, with its interval; pairs without both values are undefined.
         std: standard deviation of the differences; None below two pairs.
-        p_value: of the test that flips signs of differences at random; exact up to `MOST_FLIPPED` pairs.
+        p_value: of random flips of the differences' signs; exact up to `MOST_FLIPPED` pairs.
         wins: pairs in which the first is better.
         ties: pairs without a difference.
         losses: pairs in which the second is better.
-        holm: the p-value corrected for all comparisons; None where these are not known.
-        needed: pairs that would find such a difference, see `pairs_needed`; None where it was found, is 0, or where the
-            number of comparisons is not known.
+        holm: the p-value corrected for all comparisons, if these are known.
+        needed: pairs that would find such a difference, from `pairs_needed`; None where it was found, is 0, or the
+            number of comparisons is unknown.
     """
 
     difference: Estimate
@@ -133,12 +133,12 @@ class Comparison:
 def mean(values: Values, level: float = LEVEL, bounds: LowHigh = UNBOUNDED) -> Estimate:
     """Return the mean with Gaffke's interval where both bounds are known, else with Student's.
 
-    One seed has no interval, nor have equal seeds where a bound is not known.
+    One seed has no interval, nor have equal seeds without both bounds.
 
     Args:
         values: one per seed; None or NaN for a seed without.
         level: coverage of the interval.
-        bounds: lowest and highest value of a seed, see `Bounds`; a value outside makes them none.
+        bounds: lowest and highest value of a seed (`Bounds`); a value outside makes them none.
     """
     require(*fraction(level=level))
     known, missing = _known(values)
@@ -171,7 +171,7 @@ def mean(values: Values, level: float = LEVEL, bounds: LowHigh = UNBOUNDED) -> E
 
 
 def constant(values: Values) -> Estimate:
-    """Return a number that follows from the curriculum, so that all seeds have it: exact, without an interval."""
+    """Return a number that follows from the curriculum: exact, without an interval."""
     known, missing = _known(values)
     if not known:
         return _nothing(missing, "exact")
@@ -197,11 +197,10 @@ def mean_and_std(values: Values) -> Estimate:
 
 @takes_numbers
 def iqm(values: Sequence[Values], level: float = LEVEL, resamples: int = RESAMPLES, seed: int = 0) -> Estimate:
-    """Return the interquartile mean with a stratified bootstrap, as rliable defines both (Agarwal et al. 2021).
+    """Return the interquartile mean with a stratified bootstrap, as rliable (Agarwal et al. 2021).
 
-    The value is `scipy.stats.trim_mean` of a quarter at each side of all values together. The interval has the
-    percentiles of `scipy.stats.bootstrap`, which draws the seeds of each task apart. With few seeds it covers less than
-    it says.
+    The value is `scipy.stats.trim_mean` of a quarter at each side of all values together. The interval has percentiles
+    of `scipy.stats.bootstrap`, which draws the seeds of each task apart; with few seeds it covers less than stated.
 
     Args:
         values: for each task, one value per seed; None or NaN for a seed without.
@@ -259,7 +258,7 @@ def solved_rate(solved: Sequence[bool | None], level: float = LEVEL) -> Estimate
 def median_time(times: Values, level: float = LEVEL) -> Estimate:
     """Return the median of times, with the interval from the k-th smallest to the k-th largest.
 
-    k is the largest that keeps the level. The interval of fewer than six seeds goes from 0 to infinity at 95 %.
+    k is the largest that keeps the level. At 95 % fewer than six seeds have an interval from 0 to infinity.
 
     Args:
         times: one per seed, >= 0; infinite for a seed that never got there, None or NaN for one without result.
@@ -295,17 +294,17 @@ def interquartile_mean(
     *,
     bounds: LowHigh = UNBOUNDED,
 ) -> Estimate:
-    """Return the mean of the middle half of all values of all tasks, with a bootstrap stratified by task.
+    """Return the mean of the middle half of all tasks' values, with a bootstrap stratified by task.
 
-    Seeds have random weights, others for each task; one more value stands at known bounds, as in Gaffke's interval.
-    Fewer than ten seeds have no value: their interval would cover far less than it says.
+    Seeds have random weights for each task; one more value stands at known bounds, as in Gaffke's interval. Fewer than
+    ten seeds have no value, as their interval would cover far less than stated.
 
     Args:
         values: for each task, one value per seed; None or NaN for a seed without.
         level: coverage of the interval.
         resamples: bootstrap samples.
         seed: of the bootstrap.
-        bounds: the lowest and the highest possible value.
+        bounds: the lowest and highest possible value.
     """
     known, n, undefined = _of_tasks(values, "interquartile_mean", level, resamples)
     lowest, highest = _checked(bounds)
@@ -334,9 +333,9 @@ def compare(first: Values, second: Values, level: float = LEVEL, bounds: LowHigh
 
     Args:
         first: one value per seed.
-        second: the other agent's on the same seeds in the same order, with the same curriculum.
+        second: the other agent's on the same seeds and curriculum, in the same order.
         level: coverage of the interval.
-        bounds: the lowest and the highest possible value.
+        bounds: the lowest and highest possible value.
 
     Raises:
         ValueError: for different numbers of seeds.
@@ -354,9 +353,9 @@ def compare(first: Values, second: Values, level: float = LEVEL, bounds: LowHigh
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
-    """Return p-values corrected for their number by Holm's procedure, at most 1; None stays and does not count.
+    """Return p-values corrected for their number by Holm's procedure, at most 1; None does not count.
 
-    The chance that any of them is below 0.05 where there is no difference is at most 5 %.
+    The chance that any is below 0.05 without a difference is at most 5 %.
     """
     known = sorted((p, i) for i, p in enumerate(p_values) if p is not None)
     corrected: list[float | None] = [None] * len(p_values)
@@ -368,7 +367,7 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
 
 
 def corrected(found: Mapping[Any, Comparison]) -> dict[Any, Comparison]:
-    """Return comparisons with corrected p-values and the pairs that they need."""
+    """Return comparisons with corrected p-values and needed pairs."""
     p_values = holm([each.p_value for each in found.values()])
     count = sum(p is not None for p in p_values)
     complete = {}
@@ -386,14 +385,14 @@ def corrected(found: Mapping[Any, Comparison]) -> dict[Any, Comparison]:
 def pairs_needed(difference: float, std: float, comparisons: int = 1, level: float = LEVEL) -> int:
     """Return with how many pairs `compare` finds a difference with a chance of 80 %.
 
-    They are those of `seeds_needed`, and so many that the smallest p-value of the test, 2 / 2^n, is small enough. Both
-    are corrected for the number of comparisons (Bonferroni).
+    They are those of `seeds_needed`, and enough that the test's smallest p-value, 2 / 2^n, suffices. Both are corrected
+    for the number of comparisons (Bonferroni).
 
     Args:
         difference: true difference of means, other than 0.
-        std: standard deviation of the differences of pairs, >= 0.
+        std: standard deviation of the pairs' differences, >= 0.
         comparisons: how many are made.
-        level: 1 - level is the chance to find a difference that is not there in any of them.
+        level: 1 - level is the chance to find a false difference in any of them.
 
     Raises:
         ValueError: for values out of range, and if `MOST_SEEDS` are not enough.
@@ -408,14 +407,14 @@ def pairs_needed(difference: float, std: float, comparisons: int = 1, level: flo
 
 @takes_numbers
 def seeds_needed(difference: float, std: float, paired: bool = False, level: float = LEVEL, power: float = 0.8) -> int:
-    """Seeds of each agent that a t-test needs to find a difference of means with a given power.
+    """Return the seeds of each agent that a t-test needs to find a difference of means with a given power.
 
     Args:
         difference: true difference of means, > 0.
-        std: standard deviation over seeds, of one agent; of the differences if paired.
+        std: standard deviation over one agent's seeds; of the differences if paired.
         paired: both agents on the same seeds.
-        level: 1 - level is the chance to find a difference that is not there.
-        power: the chance to find one that is.
+        level: 1 - level is the chance to find a false difference.
+        power: the chance to find a true one.
 
     Raises:
         ValueError: for values out of range, and if `MOST_SEEDS` are not enough.
@@ -455,7 +454,7 @@ def _checked(bounds: LowHigh) -> Bounds:
 
 
 def _sign_flip(differences: Sequence[float]) -> float:
-    """Return the two-sided p-value of the sum under all flips of signs, or under many random ones."""
+    """Return the two-sided p-value of the sum under all flips of signs, or many random ones."""
     count = len(differences)
     if count <= MOST_FLIPPED:
         signs = np.array(list(product((1, -1), repeat=count)))
@@ -467,7 +466,7 @@ def _sign_flip(differences: Sequence[float]) -> float:
 
 
 def _middle_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the mean of the middle half of weighted values, for each row of weights; a row sums to 1."""
+    """Return the mean of the middle half of weighted values, for each row of weights with sum 1."""
     order = np.argsort(values)
     below = np.clip(np.cumsum(weights[:, order], axis=1), 0.25, 0.75)
     parts = np.diff(below, axis=1, prepend=0.25)

@@ -1,4 +1,4 @@
-"""The style of all figures of the report: one style sheet, one colour and mark for each agent, and sizes in inches."""
+"""The style of all figures of the report: colours and marks of agents, and sizes in inches."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from ctgraph_rl.packages import OF_REPORT
 STYLE = Path(__file__).with_name("style.mplstyle")
 
 WIDTH = 7.2
-"""Of a figure: a page's text in print."""
+"""Inches of a page's text in print."""
 
 WIDTHS = {"text": WIDTH, "column": 3.5}
-"""Inches of a figure: as wide as the text of a page, or as one of its two columns."""
+"""Inches of a figure: a page's text, or one of its two columns."""
 
 MOST_AGENTS = 6
-"""Agents of a curriculum that figures show: the style has so many colours and marks."""
+"""Agents of a curriculum that figures show, one for each colour of the style."""
 
 LONGEST_NAME = 22
 """Characters of a name in a figure."""
@@ -35,7 +35,7 @@ def require_packages(what: str = "the report", *names: str) -> None:
 
     Args:
         what: needs packages.
-        names: of packages that the extra ``report`` installs; without any, all of them.
+        names: of packages that the extra ``report`` installs; default: all.
 
     Raises:
         ModuleNotFoundError: without one of them; names the extra to install.
@@ -56,14 +56,14 @@ _COLOURS: ContextVar[Mapping[str, str] | None] = ContextVar("colours", default=N
 
 @contextmanager
 def style(width: str = "text", colours: Mapping[str, str] | None = None) -> Iterator[None]:
-    """Figures made and saved within have the report's style.
+    """Give figures that are made and saved within it the report's style.
 
     Args:
         width: one of `WIDTHS`.
         colours: of agents, by their names in figures; others have the style's.
 
     Raises:
-        ValueError: for another width, and for a colour that matplotlib does not know.
+        ValueError: for another width, and for an unknown colour.
     """
     from matplotlib import rc_context
     from matplotlib.colors import is_color_like
@@ -88,19 +88,19 @@ def figure_width() -> float:
 
 
 def beside(most: int) -> int:
-    """Return how many panels stand beside each other, of which a page's text has room for ``most``."""
+    """Return how many panels stand side by side, where a page's text has room for ``most``."""
     return max(1, round(most * figure_width() / WIDTH))
 
 
 def new_figure(width: float, height: float) -> Any:
-    """Return an empty figure, sizes in inches; it has the report's style within `style`."""
+    """Return an empty figure, in inches; within `style` it has the report's."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height))
 
 
 def panels(count: int, most: int, height: float, width: float = 1, room: float = 0.5, **shared: bool) -> Any:
-    """Return the axes of a new figure, in rows of up to ``most``; those that are not needed stay empty.
+    """Return the axes of a new figure, in rows of up to ``most``; spare ones stay empty.
 
     Args:
         count: how many are needed.
@@ -120,7 +120,7 @@ def panels(count: int, most: int, height: float, width: float = 1, room: float =
 
 
 def agents_legend(figure: Any, looks: Iterable[tuple[str, ReadOnlyValues]]) -> None:
-    """Names of agents above all panels, with the looks of their curves."""
+    """Agents' names above all panels, with the looks of their curves."""
     from matplotlib.lines import Line2D
 
     marks = [Line2D([], [], label=name, **look) for name, look in looks]
@@ -128,7 +128,7 @@ def agents_legend(figure: Any, looks: Iterable[tuple[str, ReadOnlyValues]]) -> N
 
 
 def agent_style(position: int, agent: str = "") -> NamedValues:
-    """Colour, line and mark of an agent's curve, by its place and its name; needs `style`."""
+    """Return colour, line and mark of an agent's curve; needs `style`."""
     from matplotlib import rcParams
 
     cycle = rcParams["axes.prop_cycle"].by_key()
@@ -138,7 +138,7 @@ def agent_style(position: int, agent: str = "") -> NamedValues:
 
 
 def short(name: str) -> str:
-    """A name that fits into a figure: its middle is left out; for matplotlib, which shows it unchanged."""
+    """Return a name without its middle that fits into a figure, safe for matplotlib."""
     name = terminal_text(name)
     half = LONGEST_NAME // 2
     return figure_text(name if len(name) <= LONGEST_NAME else f"{name[: half - 1]}…{name[-half:]}")
@@ -149,7 +149,7 @@ def contrast(one: Sequence[float], other: Sequence[float]) -> float:
 
     Args:
         one: red, green and blue of sRGB, each in [0, 1].
-        other: in the same way.
+        other: likewise.
     """
     dark, light = sorted((_luminance(one), _luminance(other)))
     return (light + 0.05) / (dark + 0.05)
@@ -161,7 +161,7 @@ def _luminance(colour: Sequence[float]) -> float:
 
 
 def ink(background: Sequence[float]) -> str:
-    """Return the colour of text on a background: the one of black and white with more contrast, at least 4.5."""
+    """Return black or white as the colour of text on a background, with a contrast of at least 4.5."""
     return "black" if contrast(background, (0, 0, 0)) >= contrast(background, (1, 1, 1)) else "white"
 
 

@@ -1,4 +1,4 @@
-"""Pages made of templates of jinja2, with what other people have written in them."""
+"""Pages made of jinja2 templates and texts of other people."""
 
 from __future__ import annotations
 

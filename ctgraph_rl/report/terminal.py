@@ -1,4 +1,4 @@
-"""A run on the terminal: performance matrix, curves and main metrics; of many runs, which are of different code."""
+"""A run on the terminal: performance matrix, curves and main metrics, and notes on different code."""
 
 from __future__ import annotations
 
@@ -28,31 +28,31 @@ LIFELONG = {
     "forward_transfer_ratio": "forward transfer ratio",
     "backward_transfer_ratio": "backward transfer ratio",
 }
-"""Transfer as ratios, of which 1 means none, beside differences, of which 0 means none."""
+"""Transfer as ratios, where 1 means none."""
 OF_DETECTION = ("detection_delay", "false_alarms", "labels_per_task", "label_agreement")
-"""Metrics that are shown; the others are in the file."""
+"""Metrics that are shown; the file has all."""
 
 MOST_SEEDS = 10
 """Seeds of a configuration that a sentence names."""
 
 LONGEST_LABEL = 24
-"""Characters of a task's label in a table with a line for each task; the middle of a longer one is left out."""
+"""Characters of a task's label in a table; a longer one loses its middle."""
 
 BARS, ASCII_BARS = "▁▂▃▄▅▆▇█", "_.-:=+*#"
-"""Heights of a curve's points, from the lowest value to the highest."""
+"""Heights of a curve's points, from lowest to highest."""
 
 MOST_POINTS = 32
 """Characters of a curve; more evaluations share them."""
 
 FEWEST_POINTS = 5
-"""Characters that a curve has at least; where there is less room, it is left out."""
+"""Least characters of a curve."""
 
 WIDEST = 10**6
 """Characters of a terminal on which everything fits."""
 
 
 def print_summary(run_dir: Path | str, console: Console | None = None) -> None:
-    """Print the performance matrix, the evaluation curves and the metrics of a finished run."""
+    """Print a finished run's performance matrix, evaluation curves and metrics."""
     console = Console() if console is None else console
     bars = BARS if console.encoding.lower().startswith("utf") else ASCII_BARS
     run = read_run(Path(run_dir))
@@ -92,10 +92,10 @@ def _text(plain: str) -> Text:
 
 
 def sparklines(evaluations: Mapping[str, Curve], bars: str = BARS, most: int = MOST_POINTS) -> dict[str, str]:
-    """A line of text for each task: its mean return at all evaluations, in time order, on one scale for all tasks.
+    """Return a line of text for each task: its mean return at all evaluations, on one scale.
 
-    The scale goes from the lowest value, or 0, to the highest, or 1. Evaluations beyond ``most`` share a place, which
-    shows their mean; one without a value is a space.
+    The scale goes from the lowest value, or 0, to the highest, or 1. Evaluations beyond ``most`` share a place with
+    their mean; one without a value is a space.
     """
     known = [0.0, 1.0]
     for curve in evaluations.values():
@@ -115,9 +115,9 @@ def sparklines(evaluations: Mapping[str, Curve], bars: str = BARS, most: int = M
 
 
 def _tasks(name: str, history: History, curves: Mapping[str, str]) -> Table:
-    """Return a line for each task: its return before training, the best one after a block, the last one, and its curve.
+    """Return a line for each task: its return before training, its best one after a block, its last one, and its curve.
 
-    A best that is not above 0 is of no block.
+    A best that is not above 0 has no block.
     """
     where = f"performance.csv has it after each of {len(history.ends) - 1} blocks"
     table = Table(title=_text(f"{name}: mean return on each task; {where}"))
@@ -142,7 +142,7 @@ def _shown(value: float) -> str:
 
 
 def metrics_table(metrics: Mapping[str, ReadOnlyValues], always: Sequence[str]) -> Table:
-    """Return metrics with their definitions, or why one of ``always`` is undefined; others where they have a value."""
+    """Return metrics with their definitions, or why one of ``always`` is undefined; others only with a value."""
     table = Table(title=f"Metrics; metrics.json has all {len(metrics)}")
     for name, justify in (("metric", "left"), ("value", "right"), ("definition", "left")):
         table.add_column(name, justify=justify)  # type: ignore[arg-type]
@@ -157,7 +157,7 @@ def metrics_table(metrics: Mapping[str, ReadOnlyValues], always: Sequence[str]) 
 
 
 def mixed_code(runs: Iterable[Run]) -> list[str]:
-    """Return a sentence on every configuration that was run with different code, whose runs are shown apart."""
+    """Return a sentence on every configuration with runs of different code, which are shown apart."""
     of: dict[str, dict[tuple[str, str], list[Run]]] = {}
     for run in runs:
         config = {**as_before(run.about["config"]), "seed": 0}
@@ -182,7 +182,7 @@ def mixed_code(runs: Iterable[Run]) -> list[str]:
 
 
 def print_problems(problems: Sequence[Problem], runs: Sequence[Run]) -> bool:
-    """Print on standard error what is left out, and what is to be said of code.
+    """Print on standard error what is left out, and notes on code.
 
     Returns:
         Whether something is left out, or runs of one configuration are of different code.
@@ -198,12 +198,12 @@ def print_problems(problems: Sequence[Problem], runs: Sequence[Run]) -> bool:
 
 
 def print_note(about: str, sentence: str) -> None:
-    """Print on standard error what is to be said about something."""
+    """Print a note on standard error."""
     print(terminal_text(f"{about}: {sentence}"), file=sys.stderr)
 
 
 def group_size(run: Run) -> int:
-    """Return how many seeds a run was trained with, itself among them; 1 for a single run."""
+    """Return how many seeds a run was trained with, itself included."""
     together = run.about.get("together")
     return len(together) if isinstance(together, list) and together else 1
 
@@ -211,7 +211,7 @@ def group_size(run: Run) -> int:
 def code_notes(runs: Sequence[Run]) -> list[str]:
     """Return sentences on runs of an older numbers version, of unknown source, and of groups where others are not.
 
-    Groups are those of runs, and those of the single-task experts that they are compared with.
+    Groups are those of runs and of their single-task experts.
     """
     older = 0
     unknown = 0
@@ -238,7 +238,7 @@ def code_notes(runs: Sequence[Run]) -> list[str]:
 
 
 def label_notes(runs: Sequence[Run]) -> list[str]:
-    """Return what is to be known of evaluations of runs whose learners gave tasks labels themselves, if there are."""
+    """Return notes on evaluations of runs whose learners gave tasks labels."""
     count = sum(run.history is not None and bool(run.history.spans) for run in runs)
     how = "evaluation uses each task's most frequent label, chosen with knowledge of the true tasks"
     return [f"{count} of {len(runs)} runs have labels of a detector: {how}"] if count else []

@@ -1,4 +1,4 @@
-"""Success while rows of an evaluation adapt, episode by episode, over the curve of the best search."""
+"""Success while evaluated rows adapt, episode by episode, over the best search's curve."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ KINDS = ("trained", "held-out")
 
 
 def adaptation_curves(section: Section) -> CaptionedFigure | None:
-    """Return the curves of all agents in the last evaluation with adaptation; None without one."""
+    """Return all agents' curves of the last evaluation with adaptation, if any."""
     shown = section.results[:MOST_AGENTS]
     kinds = [kind for kind in KINDS if any(_of_seeds(result, kind) for result in shown)]
     if not kinds:

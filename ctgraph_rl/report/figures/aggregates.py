@@ -1,7 +1,7 @@
-"""Performance profiles and the probability of improvement, as rliable defines and draws them (Agarwal et al. 2021).
+"""Performance profiles and the probability of improvement, as in rliable (Agarwal et al. 2021).
 
-Scores are the mean returns at the last evaluation of each task. Intervals are percentiles of a bootstrap that draws the
-seeds of each task and agent apart; those of few seeds cover less than they say.
+Scores are mean returns at the last evaluation of each task. Intervals are percentiles of a bootstrap over the seeds of
+each task and agent; those of few seeds cover less than stated.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ctgraph_rl.report.sections import Result, Section
 from ctgraph_rl.report.style import MOST_AGENTS, agent_style, beside, figure_width, new_figure, short
 
 FEWEST_SEEDS = 3
-"""Finished seeds from which on an agent is in these figures."""
+"""Finished seeds from which an agent is shown."""
 
 RESAMPLES = 2000
 """Bootstrap samples, as in rliable's examples."""
@@ -28,7 +28,7 @@ TAILS = (0.025, 0.975)
 THRESHOLDS = 101
 
 Scores = Mapping[str, np.ndarray]
-"""For each task the scores of all seeds, float64 [seeds]."""
+"""Each task's scores of all seeds, float64 [seeds]."""
 
 BOOTSTRAP = f"percentiles of {RESAMPLES:,} bootstrap samples stratified by task, at 95 %"
 
@@ -42,7 +42,7 @@ class Interval(NamedTuple):
 
 
 def scores(result: Result) -> dict[str, np.ndarray]:
-    """Return an agent's mean returns at the last evaluation of each task that is not held out."""
+    """Return an agent's mean returns at the last evaluation of each trained task."""
     found: dict[str, list[float]] = {}
     for run in result.finished:
         for task in run.tasks:
@@ -69,14 +69,13 @@ def performance_profile(of_tasks: Scores, thresholds: np.ndarray, seed: int = 0)
 
 
 def _pooled(of_tasks: Scores) -> np.ndarray:
-    """Return the scores of all tasks, float64 [tasks * seeds]."""
     return np.concatenate(list(of_tasks.values()))
 
 
 def probability_of_improvement(first: Scores, second: Scores, seed: int = 0) -> Interval:
-    """Return how likely a run of one agent is better than one of another on a task: the mean over their shared tasks.
+    """Return the probability that a run of one agent is better than one of another, the mean over shared tasks.
 
-    That is the statistic of Mann and Whitney over the number of pairs of seeds; equal scores count half.
+    It is the statistic of Mann and Whitney over the number of pairs of seeds; equal scores count half.
 
     Args:
         first: scores of the agent that may be better.
@@ -92,7 +91,7 @@ def probability_of_improvement(first: Scores, second: Scores, seed: int = 0) -> 
 
 
 def _drawn(values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return bootstrap samples of the seeds of a task, float64 [samples, seeds]."""
+    """Return bootstrap samples of a task's seeds, float64 [samples, seeds]."""
     return values[rng.integers(len(values), size=(RESAMPLES, len(values)))]
 
 
@@ -109,7 +108,7 @@ def _shown(section: Section) -> list[Result]:
 
 
 def profiles(section: Section) -> CaptionedFigure | None:
-    """Return the performance profiles of all agents; None without two agents of enough seeds."""
+    """Return all agents' performance profiles; None without two agents of enough seeds."""
     shown = _shown(section)
     if len(shown) < 2:
         return None

@@ -1,4 +1,4 @@
-"""Several experiments in one figure: a panel for each curriculum, and one legend of all agents."""
+"""Several experiments in one figure: a panel for each curriculum, and one legend."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ COLUMNS = 3
 
 
 def experiments(found: Sequence[Section]) -> CaptionedFigure | None:
-    """Return the mean return over all tasks on several curricula; None for fewer than two with a finished run."""
+    """Return the mean returns on several curricula; None for fewer than two with a finished run."""
     measured = [section for section in found if section.finished]
     if len(measured) < 2:
         return None

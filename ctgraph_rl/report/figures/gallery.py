@@ -36,18 +36,18 @@ class Written(NamedTuple):
 
 
 def left_out(count: int, most: int, what: str) -> str:
-    """Return a sentence on how many are shown; empty where all are."""
+    """Return a sentence on how many are shown, if not all."""
     return f" The first {most} of {count} {what} are shown." if count > most else ""
 
 
 class Gallery:
-    """Writes figures into the folder of a report, each under its own name.
+    """Writes figures into a report's folder, with unique names.
 
     Args:
         folder: of the report.
-        width: see `style`.
-        colours: see `style`.
-        count: is called with how many figures are done.
+        width: as for `style`.
+        colours: as for `style`.
+        count: takes how many figures are done.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Gallery:
         make_folder(folder / FOLDER)
 
     def write(self, names: tuple[str, ...], figures: Iterable[CaptionedFigure | None]) -> list[Written]:
-        """Draw and write figures, skipping None; their file names start with ``names``."""
+        """Draw and write figures, skipping None; file names start with ``names``."""
         written = []
         with style(self.width, self.colours):
             for one in figures:

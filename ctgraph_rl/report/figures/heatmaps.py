@@ -1,4 +1,4 @@
-"""Heat maps of an agent: the performance matrix, and what each block's training did to each task."""
+"""Heat maps of an agent: its performance matrix, and what each block changed."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ MOST_NUMBERS = 10
 """Tasks up to which cells have numbers."""
 
 MOST_INTERVALS = 5
-"""Tasks up to which cells have intervals, too."""
+"""Tasks up to which cells have intervals."""
 
 MOST_NAMES = 32
 """Tasks up to which each has its name."""
 
 NEGATIVE = -0.05
-"""Share of the scale from which on a cell without number is marked as negative."""
+"""Share of the scale from which a cell without number is marked as negative."""
 
 NO_VALUE = (0.85, 0.85, 0.85)
 """Colour of a cell without a value."""
@@ -47,7 +47,7 @@ def transfer_maps(section: Section, result: Result, trees: Trees) -> CaptionedFi
 
 
 def draw_matrices(section: Section, result: Result) -> Any:
-    """Performance and transfer side by side; below each other where there are many tasks."""
+    """Performance and transfer side by side, or below each other for many tasks."""
     performance = result.performance()
     transfer = result.transfer()
     tasks = len(performance[0])
@@ -73,7 +73,7 @@ def draw_performance(axes: Any, matrix: Estimates, labels: Sequence[str], traine
 
 
 def draw_transfer(axes: Any, matrix: Estimates, labels: Sequence[str], trained: Sequence[Sequence[int]]) -> None:
-    """Changes of return, centred on zero; a dash marks losses where cells have no numbers, for grey prints."""
+    """Changes of return, centred on zero; without numbers a dash marks losses for grey prints."""
     values = _values(matrix)
     largest = np.nanmax(abs(values), initial=0.0) or 1.0
     _draw(axes, matrix, "PuOr", (-largest, largest), labels, first=1)
@@ -85,7 +85,7 @@ def draw_transfer(axes: Any, matrix: Estimates, labels: Sequence[str], trained: 
 
 
 def _values(matrix: Estimates) -> np.ndarray:
-    """Return values as float64 [rows, tasks], nan where there is none."""
+    """Return values as float64 [rows, tasks], nan for none."""
     return np.array([[cell.value for cell in row] for row in matrix], dtype=np.float64, ndmin=2)
 
 
@@ -97,7 +97,7 @@ def _draw(
     labels: Sequence[str],
     first: int = 0,
 ) -> None:
-    """Draw the cells, grey where there is no value, with means and intervals where there is room.
+    """Draw the cells, grey for none, with means and intervals where there is room.
 
     Args:
         axes: where they go.
@@ -105,7 +105,7 @@ def _draw(
         colours: name of a colour map.
         scale: its lowest and highest value.
         labels: of the tasks.
-        first: number of the first row's block; from 1 on the rows are changes, and have a sign.
+        first: the first row's block; from 1 on rows are changes and have a sign.
     """
     axes.set_facecolor(NO_VALUE)
     values = _values(matrix)

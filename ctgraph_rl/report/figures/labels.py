@@ -1,4 +1,4 @@
-"""Labels that learners gave to tasks themselves, against the true tasks, over the frames of a run."""
+"""Labels that learners gave to tasks, against the true tasks, over the frames of a run."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ MOST_STRIPS = 30
 """Runs that have a strip."""
 
 NARROWEST = 0.03
-"""Share of the frames from which on a part of a strip has a number."""
+"""Share of the frames from which a part of a strip has a number."""
 
 NOT_LEARNED = 0.35
 """Opacity of frames that were not learned from."""
 
 SEVERAL = (0.85, 0.85, 0.85)
-"""Colour of blocks with several tasks, and of labels that acted only in them."""
+"""Colour of blocks with several tasks, and of labels that acted only there."""
 
 
 def label_strips(section: Section) -> CaptionedFigure | None:
-    """Return the labels of all runs whose learners gave them; None without one."""
+    """Return the labels of all runs whose learners gave them, if any."""
     runs = _runs(section)
     if not runs:
         return None
@@ -90,7 +90,6 @@ def _runs(section: Section) -> list[tuple[str, Run]]:
 def _part(
     axes: Any, row: int, place: tuple[float, float], text: str, colour: Any, room: float, opacity: float = 1.0
 ) -> None:
-    """Draw a part of a strip, with its number if it is wide enough."""
     start, end = place
     axes.barh(row, end - start, 0.6, left=start, color=colour, alpha=opacity, linewidth=0)
     if end - start >= NARROWEST * room:
@@ -99,7 +98,7 @@ def _part(
 
 
 def _colour(task: int | None) -> tuple[float, float, float]:
-    """Return the colour of a task, from a scale that also differs in grey; further tasks have the colours again."""
+    """Return a task's colour, from a scale that also differs in grey and repeats."""
     from matplotlib import colormaps
 
     shades = 8

@@ -1,4 +1,4 @@
-"""Learning curves: mean return on each task over the run, and return while training, as means over seeds."""
+"""Learning curves over seeds: mean return on each task, and return while training."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MOST_TASKS = 32
 """Tasks that have a panel."""
 
 MANY_BLOCKS = 12
-"""Blocks from which on the lines at their ends are thinner."""
+"""Blocks from which the lines at their ends are thinner."""
 
 MOST_SEEDS = 20
 """Seeds up to which each has a thin line."""
@@ -42,11 +42,11 @@ MARGIN = 0.03
 """Share of the frames that an axis shows beside them."""
 
 PLACES = 160
-"""Means over equal numbers of frames that the return while training is shown as, in all blocks together."""
+"""Means that a curve of the return while training has, in all blocks together."""
 
 
 def learning_curves(section: Section) -> CaptionedFigure | None:
-    """Return the curves of all agents at evaluations, a panel for each task; None without a finished run."""
+    """Return all agents' curves at evaluations, a panel for each task; None without a finished run."""
     if not section.finished:
         return None
     tasks = left_out(len(section.labels), MOST_TASKS, "tasks")
@@ -70,7 +70,7 @@ def learning_curves(section: Section) -> CaptionedFigure | None:
 
 
 def mean_curves(section: Section) -> CaptionedFigure | None:
-    """Return the mean return over all tasks of all agents at evaluations; None without a finished run."""
+    """Return all agents' mean return over tasks at evaluations; None without a finished run."""
     if not section.finished:
         return None
     caption = (
@@ -86,7 +86,7 @@ def mean_curves(section: Section) -> CaptionedFigure | None:
 
 
 def training_curves(section: Section) -> CaptionedFigure | None:
-    """Return the return while training of all agents over all blocks; None where no run measured it."""
+    """Return all agents' return while training; None where no run measured it."""
     if not any(history.training for history in histories(section.finished)):
         return None
     caption = (
@@ -119,7 +119,7 @@ def _training(result: Result, blocks: Sequence[tuple[int, tuple[int, int]]], pla
 
 
 def draw_means(axes: Any, section: Section, looks: Mapping[str, dict[str, Any]]) -> None:
-    """Draw the mean return over all tasks of a section's agents that have a look."""
+    """Draw the mean return over all tasks of a section's agents with a look."""
     _mark_blocks(axes, section, None)
     for result in section.results:
         if result.agent in looks:
@@ -155,7 +155,7 @@ def _draw(axes: Any, look: Mapping[str, Any], pieces: Sequence[list[Point]], see
 
 
 def _finished(grid: Any, section: Section, ylabel: str) -> Any:
-    """Return a figure with one scale for all panels, from the curves' means, names of axes, and a legend of agents."""
+    """Return a figure with one scale, names of axes and a legend of agents."""
     low = 0.0
     high = 1.0
     for axes in grid.ravel():
@@ -179,6 +179,6 @@ def _finished(grid: Any, section: Section, ylabel: str) -> Any:
 
 
 def named(result: Result) -> str:
-    """Return the name of an agent in a legend, with its number of seeds."""
+    """Return an agent's name in a legend, with its number of seeds."""
     agent = terminal_text(result.agent)
     return figure_text(f"{agent if len(agent) <= 60 else agent[:59] + '…'} (n = {result.n})")

@@ -1,4 +1,4 @@
-"""The tasks' trees of an agent: goals, where one trained seed went, and what it does there."""
+"""An agent's trees of tasks: goals, where one trained seed went, and its actions."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ EPISODES = 100
 
 
 class Trees(NamedTuple):
-    """The curriculum and the trained agent of a run, as far as they can be read."""
+    """A run's curriculum and trained agent, as far as they can be read."""
 
     curriculum: Curriculum | None
     trained: Trained | None
@@ -30,7 +30,7 @@ class Trees(NamedTuple):
 
 
 def task_trees(section: Section, result: Result, found: Trees) -> CaptionedFigure | None:
-    """Return the tasks' trees; None where the run has no curriculum that can be read."""
+    """Return the tasks' trees; None without a readable curriculum."""
     if found.curriculum is None:
         return None
     one = result.finished[0]
@@ -47,7 +47,7 @@ def task_trees(section: Section, result: Result, found: Trees) -> CaptionedFigur
 
 
 def draw_trees(trees: Trees, seed: int) -> Any:
-    """Draw a panel for each task: its tree and goal, with visits and actions of the agent where there is one."""
+    """Draw each task's tree and goal, with the agent's visits and actions, if any."""
     assert trees.curriculum is not None
     tasks = list(zip(ct_graphs(trees.curriculum.tasks, "a tree"), trees.curriculum.labels, strict=True))[:MOST_TREES]
     deepest = max(task.graph.depth for task, _ in tasks)
@@ -60,7 +60,7 @@ def draw_trees(trees: Trees, seed: int) -> Any:
 
 
 def find_trees(run: Run) -> Trees:
-    """Return the agent and the curriculum of a run as far as its directory has them."""
+    """Return the agent and curriculum of a run's directory, if any."""
     try:
         curriculum = Curriculum.from_json(run.path / CURRICULUM)
     except (OSError, ValueError) as error:
