@@ -62,7 +62,10 @@ def find_leaves(tasks: Sequence[Task], goals: Iterable[Goal]) -> list[int]:
     numbers = [goal for goal in goals if is_int(goal)]  # decisions or end states?
     fix = 'write decisions as "1" or "1.2", and numbers of end states as an int64 tensor'
     require((not numbers, f"goals must be decisions, got {numbers[:3]}: {fix}"))
-    return [replace(task, goal=goal).goal_leaf for task, goal in zip(tasks, goals, strict=True)]
+    leaves = []
+    for task, goal in zip(tasks, goals, strict=True):
+        leaves.append(replace(task, goal=goal).goal_leaf)  # type: ignore[arg-type]
+    return leaves
 
 
 EpisodePlace = tuple[Tensor, Tensor, Tensor]
