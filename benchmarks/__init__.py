@@ -1,4 +1,4 @@
-"""How fast environments and agents are: measured in a checkout, and no part of the wheel.
+"""Speed of environments and agents, measured in a checkout.
 
-``python -m benchmarks.environments`` runs `environments`, and ``python -m benchmarks.agents`` runs `agents`.
+``python -m benchmarks.environments`` and ``python -m benchmarks.agents`` run them.
 """

@@ -1,7 +1,7 @@
 """How fast agents learn on one device: ``python -m benchmarks.agents --device cuda``.
 
-PPO and LSTM-PPO learn as in a run: step by step, captured, and PPO compiled as well. Many seeds learn as one job, with
-stacked weights. The yardstick is the environment with given actions, on the same device and in the same run.
+PPO and LSTM-PPO learn as in a run: step by step, captured, and PPO compiled. Many seeds learn as one job, with stacked
+weights. The yardstick is the environment with given actions, on the same device in the same run.
 """
 
 from __future__ import annotations
@@ -33,25 +33,25 @@ TASKS = {
 }
 
 GOALS = {"ppo": 10e6, "lstm_ppo": 1e6}
-"""Environment steps a second that one agent shall learn from."""
+"""Environment steps a second for one agent to learn from."""
 
 MAIN_JOB = 4 * 204_800
-"""Frames of a seed of the main job, LSTM-PPO on ``su_b1_4tasks``."""
+"""Frames of the main job's seed, LSTM-PPO on ``su_b1_4tasks``."""
 
 SEEDS_GOAL = 1024 * MAIN_JOB / (15 * 60)
-"""Environment steps a second of 1,024 seeds of the main job in 15 minutes."""
+"""Environment steps a second for 1,024 seeds of the main job in 15 minutes."""
 
 ENDLESS = 10**6
-"""Batches; more than are measured."""
+"""More batches than are measured."""
 
 
 def rungs(device: torch.device, num_rows: Sequence[int], num_seeds: Sequence[int]) -> Iterator[Rung]:
     """Yield what is measured, in the order of the table.
 
     Args:
-        device: where environment and agents live.
+        device: of environment and agents.
         num_rows: environments of one agent, of those with a goal.
-        num_seeds: agents that learn as one job, each with the environments of its yaml file.
+        num_seeds: agents of one job, each with its yaml file's environments.
     """
     for name, (label, task) in TASKS.items():
         ways: dict[str, dict[str, bool]] = {"step by step": {"captured": False}, "captured": {}}
@@ -67,14 +67,14 @@ def rungs(device: torch.device, num_rows: Sequence[int], num_seeds: Sequence[int
 
 
 def settings(name: str) -> dict[str, Any]:
-    """Return what an agent's yaml file says, over what the files say that it starts from."""
+    """Return an agent's yaml file with those that it starts from."""
     own = yaml.safe_load(Path(conf_dir(), "agent", f"{name}.yaml").read_text(encoding="utf-8"))
     before = [settings(other) for other in own.pop("defaults", []) if other != "_self_"]
     return {key: value for each in (*before, own) for key, value in each.items()}
 
 
 def built(name: str, task: Task, **changes: Any) -> PolicyGradient:
-    """Return an agent on the CPU, with the hyperparameters of its yaml file and changes of them."""
+    """Return an agent on the CPU, with its yaml file's hyperparameters and changes."""
     values = {**settings(name), **changes}
     module, _, of_class = values.pop("_target_").rpartition(".")
     kind: Any = class_named(module, of_class)
@@ -84,7 +84,7 @@ def built(name: str, task: Task, **changes: Any) -> PolicyGradient:
 def learning(
     name: str, task: Task, num_envs: int, device: torch.device, captured: bool = True, compile: bool = False
 ) -> TimedRun:
-    """Return a run of one agent: it learns from a batch."""
+    """Return a run in which an agent learns from a batch."""
     changes = {"num_envs": num_envs, **({"compile": True} if compile else {})}
     agent = built(name, task, **changes).to(device)
     agent.capturable = agent.policy.capturable = captured  # type: ignore[misc]
@@ -102,7 +102,7 @@ def learning(
 
 
 def seeds(name: str, task: Task, num_seeds: int, device: torch.device) -> TimedRun:
-    """Return a run of many seeds of an agent, as ``together=true`` trains them: each learns from its own batch."""
+    """Return a run of many seeds, as of ``together=true``, each learning from its batch."""
     agents = [built(name, task).to(device) for _ in range(num_seeds)]
     generators = [torch.Generator(device="cpu").manual_seed(seed) for seed in range(num_seeds)]
     group = CapturedGroup(agents, generators)

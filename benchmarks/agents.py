@@ -1,12 +1,11 @@
 """How fast agents learn, beside Stable-Baselines3: python -m benchmarks.agents.
 
 Every agent learns with the settings of its yaml file on 256 rows, Stable-Baselines3's with the same ones as far as it
-has them: on ctgraph_rl.sb3.SB3VecEnv, and on what its make_vec_env makes of the single environment; and with its
-own defaults on 8 rows. Every round lets each learn for a while, one after the other, so what slows the machine down
-slows all of them; frames per second are medians of the rounds. Then each learns from scratch with several seeds until
-it reaches the goal in 90 of 100 greedy episodes; the time of these evaluations does not count. Seconds are those of one
-core. --cells measures only LSTM-PPO, with each cell in place of the LSTM. Ctrl-C ends a measurement, and what was
-measured until then is printed.
+has them: on ctgraph_rl.sb3.SB3VecEnv, and on its make_vec_env of the single environment; and with its own defaults on
+8 rows. Every round lets each learn for a while in turn, so what slows the machine down slows all of them; frames per
+second are medians of the rounds. Then each learns with several seeds until it reaches the goal in 90 of 100 greedy
+episodes, whose time does not count. Seconds are those of one core. --cells measures only LSTM-PPO, with each cell in
+place of the LSTM. Ctrl-C ends a measurement, and prints what was measured until then.
 
 --device cuda measures benchmarks.agent_ladder instead.
 """
@@ -51,14 +50,14 @@ PAIRS = (
     ("lstm_ppo", "CT-SU-B1"),
     ("lstm_ppo", "CT-CO-B1"),
 )
-"""Which agent learns which task."""
+"""Agents and their tasks."""
 
 
 class Learning(Protocol):
     """An agent with its environments."""
 
     def learn(self) -> int:
-        """Learn for a while, and return the number of frames."""
+        """Learn for a while; return the frames."""
         ...
 
     def success(self) -> float:
@@ -68,7 +67,7 @@ class Learning(Protocol):
 
 @dataclass
 class Contender:
-    """A learner of a task, and its measurements."""
+    """A learner and its measurements."""
 
     agent: str
     task: str
@@ -78,7 +77,7 @@ class Contender:
     solved: list[tuple[int, float] | None] = field(default_factory=list)
 
     def measure(self, learning: Learning, seconds: float) -> None:
-        """Measure frames per second over at least so many seconds."""
+        """Measure frames per second over so many seconds."""
         frames = 0
         start = time.process_time()
         while time.process_time() - start < seconds:
@@ -86,7 +85,7 @@ class Contender:
         self.speeds.append(frames / (time.process_time() - start))
 
     def solve(self, seed: int, max_frames: int) -> None:
-        """Learn until the task is solved, and note frames and seconds; None if ``max_frames`` are not enough."""
+        """Learn until the task is solved; note frames and seconds, or None after ``max_frames``."""
         learning = self.make(seed)
         frames = 0
         seconds = 0.0
@@ -104,13 +103,13 @@ class Contender:
 
 
 def cell_named(name: str) -> partial[Any]:
-    """Return what builds a cell with the settings of its file."""
+    """Return what builds a cell with its file's settings."""
     entry = next(entry for entry in catalogue("cell") if entry.name == name)
     return partial(entry.kind, **entry.settings)
 
 
 def settings(name: str) -> NamedValues:
-    """Return an agent's hyperparameters for `ROWS` rows, with as many frames in a batch as in its yaml file."""
+    """Return hyperparameters for `ROWS` rows, with the yaml file's frames per batch."""
     given = agent_ladder.settings(name)
     frames = given["num_envs"] * given["num_steps"]
     return {**given, "num_envs": ROWS, "num_steps": max(1, frames // ROWS)}
@@ -123,7 +122,7 @@ class Ours:
         name: the agent.
         task: what it learns.
         seed: decides weights, exploration and environment.
-        cell: what it remembers with, a file of ``conf/cell``; None: as the agent has it.
+        cell: a file of ``conf/cell``; None: the agent's.
     """
 
     def __init__(self, name: str, task: Task, seed: int, cell: str | None = None) -> None:
@@ -149,7 +148,7 @@ class Ours:
 
 
 def contenders(agents: list[str]) -> Iterator[Contender]:
-    """Yield everything to measure; Stable-Baselines3 only if it is installed."""
+    """Yield everything to measure, Stable-Baselines3 if installed."""
     for name, label in PAIRS:
         if name not in agents:
             continue
@@ -163,14 +162,14 @@ def contenders(agents: list[str]) -> Iterator[Contender]:
 
 
 def cells(names: list[str]) -> Iterator[Contender]:
-    """Yield LSTM-PPO with each of the cells, on the task that needs memory and has fewest different images."""
+    """Yield LSTM-PPO with each cell, on the task that needs memory and has fewest images."""
     for name in names:
         make = partial(Ours, "lstm_ppo", TASKS["CT-SU-B1"], cell=name)
         yield Contender(f"lstm_ppo cell={name}", "CT-SU-B1", "ours", make)
 
 
 def table(measured: list[Contender]) -> str:
-    """Format medians in Markdown; the ratio says how many times as fast ours is."""
+    """Format medians in Markdown, with the speed relative to ours."""
     ours = {
         (one.agent, one.task): statistics.median(one.speeds) for one in measured if one.who == "ours" and one.speeds
     }
@@ -194,7 +193,7 @@ def _solved(found: list[tuple[int, float] | None]) -> tuple[str, str]:
 
 
 def on_device(device: torch.device, options: ladder.Options) -> str:
-    """Measure `benchmarks.agent_ladder` on a device, with the agents of the options; return the table."""
+    """Measure `benchmarks.agent_ladder`; return its table."""
     rungs = []
     for rung in agent_ladder.rungs(device, options.rows, options.together):
         if rung.name == agent_ladder.ENVIRONMENT or rung.name.partition(",")[0] in options.agents:
@@ -233,7 +232,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def learned(options: ladder.Options) -> list[Contender]:
-    """Let agents learn for as long as the options say, or until Ctrl-C; return them with their measurements."""
+    """Let agents learn as the options say, or until Ctrl-C; return them."""
     console = Console(stderr=True)
     if not find_spec("sb3_contrib"):
         missing = "Stable-Baselines3 is missing, only ours are measured: pip install 'ctgraph_rl[benchmark]'"

@@ -1,6 +1,6 @@
 """The environment on one device, from step by step to fused: ``python -m benchmarks.environments --device cuda``.
 
-The yardstick is a copy of as many bytes as the observations have, on the same device and in the same run.
+The yardstick is a copy of the observations' bytes, on the same device in the same run.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ T = TypeVar("T")
 Options = argparse.Namespace
 
 TimedRun = Callable[[], int]
-"""Runs for a while, and returns the number of observations."""
+"""Runs for a while; returns the observations."""
 
 NUM_STEPS = 32
 """Steps of a rollout."""
 
 COPY = "copy of the observations"
 GOAL, FUSED = 0.5e9, 5e9
-"""Observations a second at 65,536 rows: the goal, and that of fused steps."""
+"""Observations a second at 65,536 rows: the goal, and fused steps."""
 
 
 @dataclass
 class Rung:
-    """A way to step or to learn, and its observations a second."""
+    """A way to step or learn, and its observations a second."""
 
     name: str
     task: str
@@ -134,11 +134,11 @@ def _fused(tasks: Sequence[Task], device: torch.device) -> TimedRun:
 
 
 def in_words(rows: Rows, steps: Steps) -> tuple[RowParams, Tensor]:
-    """Return the rows' tasks and the buffer of observations, with images as 64-bit words if steps only copy them.
+    """Return rows' tasks and the buffer of observations, as 64-bit words if steps only copy images.
 
     Returns:
-        The tasks, with a bank of int64 [views, bytes / 8], and the buffer, int64 [steps + 1, N, bytes / 8]; both as
-        they are for images with noise, late rotation or a reward cue, and for those that are not whole words.
+        The tasks, with a bank of int64 [views, bytes / 8], and the buffer, int64 [steps + 1, N, bytes / 8]; both
+        unchanged for images with noise, late rotation or a cue, or without whole words.
     """
     params = rows.params
     uses = rows.uses
@@ -153,17 +153,15 @@ def in_words(rows: Rows, steps: Steps) -> tuple[RowParams, Tensor]:
 def write_step(
     outputs: Sequence[Tensor], state: Sequence[Tensor], action: Tensor, words: Words, params: Any, uses: Any
 ) -> tuple[tuple[Tensor, ...], Words]:
-    """Take a step of `rollout` by the tensor engine, and write what it shows into its buffers.
+    """Take a step of `rollout` by the tensor engine, and write it into buffers.
 
-    Compiled, it writes each observation once, where it belongs.
+    Compiled, it writes each observation once.
 
     Args:
-        outputs: the buffers of the next observation, and of the step's reward, done and outcome.
-        state: of the rows, the fields of `RowState`; a plain tuple, as ``torch.compile`` returns no named ones.
+        outputs: buffers of the next observation, and the step's reward, done and outcome.
+        state: the fields of `RowState`; ``torch.compile`` returns no named tuples.
         action: int64 [N].
-        words: the small draws of the present tick.
-        params: the rows' tasks.
-        uses: what the rows have use for.
+        words: the present tick's draws.
 
     Returns:
         The next states, and their draws.
@@ -186,7 +184,7 @@ WAYS: dict[str, Callable[[Sequence[Task], torch.device], TimedRun]] = {
     "rollout, captured": _captured,
     "rollout, fused and captured": _fused,
 }
-"""The ways to step, from the slowest on."""
+"""Ways to step, the slowest first."""
 
 
 def _prepared(tasks: Sequence[Task], device: torch.device) -> tuple[Rows, Steps, Tensor]:
@@ -195,7 +193,7 @@ def _prepared(tasks: Sequence[Task], device: torch.device) -> tuple[Rows, Steps,
 
 
 def _replayed(region: Region, rows: Rows, actions: Tensor) -> TimedRun:
-    """Return a run of a region that takes the states of rows and returns those that steps led to."""
+    """Return a run of a region from rows' states to the states after its steps."""
 
     def run() -> int:
         rows.state = RowState(**region(rows.state._asdict()))
@@ -205,13 +203,13 @@ def _replayed(region: Region, rows: Rows, actions: Tensor) -> TimedRun:
 
 
 def parsed(parser: argparse.ArgumentParser, arguments: list[str] | None, seconds: float, limit: float) -> Options:
-    """Return the options of a benchmark, those of all benchmarks among them.
+    """Return the options of a benchmark.
 
     Args:
         parser: with the options of one benchmark.
-        arguments: of the command line; None: those of this process.
-        seconds: least time of a measurement, the default.
-        limit: seconds after which no measurement begins, the default.
+        arguments: None: those of this process.
+        seconds: default of the least time of a measurement.
+        limit: default of the seconds after which no measurement begins.
 
     Raises:
         ValueError: for numbers out of range.
@@ -226,14 +224,14 @@ def parsed(parser: argparse.ArgumentParser, arguments: list[str] | None, seconds
 
 
 def climb(rungs: list[Rung], options: Options, device: torch.device, in_turn: bool = False) -> None:
-    """Measure a ladder for as long as the options say, or until Ctrl-C.
+    """Measure a ladder as the options say, or until Ctrl-C.
 
     Args:
         rungs: the ladder.
         options: of the command line.
         device: of all rungs.
-        in_turn: every round measures each rung once, so that what slows the machine down slows all; else each rung is
-            made, measured and dropped.
+        in_turn: every round measures each rung once, so that all suffer alike; else each rung is made, measured and
+            dropped.
     """
     rounds = 1 if in_turn else options.rounds
     times = options.rounds if in_turn else 1
@@ -243,7 +241,7 @@ def climb(rungs: list[Rung], options: Options, device: torch.device, in_turn: bo
 
 
 def report(rungs: list[Rung], options: Options, device: torch.device, yardstick: str = COPY) -> str:
-    """Return on which machine a ladder was measured, and its table."""
+    """Return the machine and a ladder's table."""
     about = f"{machine(device)}; medians of {options.rounds} rounds"
     return f"{about}\n\n{table(found(rungs, yardstick), yardstick)}"
 
@@ -258,7 +256,7 @@ def machine(device: torch.device) -> str:
 
 
 def measure(rung: Rung, rounds: int, seconds: float, device: torch.device) -> None:
-    """Measure observations a second; for a way that fails, note why, and measure the others."""
+    """Measure observations a second, or note why a way fails."""
     try:
         run = rung.make()
         for _ in range(WARM_UP + 1):
@@ -273,7 +271,7 @@ def measure(rung: Rung, rounds: int, seconds: float, device: torch.device) -> No
 
 
 def _speed(run: TimedRun, at_once: int, seconds: float, device: torch.device) -> float:
-    """Return observations a second; the device is waited for after so many runs at once."""
+    """Return observations a second, waiting for the device after ``at_once`` runs."""
     count = 0
     start = finished(device)
     while (now := finished(device)) - start < seconds:
@@ -282,14 +280,14 @@ def _speed(run: TimedRun, at_once: int, seconds: float, device: torch.device) ->
 
 
 def finished(device: torch.device) -> float:
-    """Return the time in seconds, once a device has done all that it was given."""
+    """Return the time in seconds, once a device is idle."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()
 
 
 def until(limit: float, items: Iterable[T]) -> Iterator[T]:
-    """Yield items for so many seconds."""
+    """Yield items for some seconds."""
     start = time.perf_counter()
     for item in items:
         if time.perf_counter() - start > limit:
@@ -298,13 +296,13 @@ def until(limit: float, items: Iterable[T]) -> Iterator[T]:
 
 
 def found(measured: Sequence[Rung], yardstick: str = COPY) -> list[dict[str, Any]]:
-    """Return what was measured as plain values: medians, and their ratios to the yardstick.
+    """Return medians and their ratios to the yardstick as plain values.
 
-    The yardstick is that of the same task and rows, or where there is none, of the most rows.
+    The yardstick has the same task and rows, or else the most rows.
 
     Args:
-        measured: the ladder; what was not measured is left out.
-        yardstick: the name of the rung that others are compared with.
+        measured: the ladder; unmeasured rungs are left out.
+        yardstick: the rung to compare with.
     """
     known = [rung for rung in measured if rung.speeds or rung.failure]
     median = {(rung.name, rung.num_rows, rung.task): statistics.median(rung.speeds) for rung in known if rung.speeds}
@@ -325,7 +323,7 @@ def found(measured: Sequence[Rung], yardstick: str = COPY) -> list[dict[str, Any
 
 
 def table(rows: Sequence[Mapping[str, Any]], yardstick: str = COPY) -> str:
-    """Format what `found` returns in Markdown, each row with its ratio to the yardstick and its share of the goal."""
+    """Format `found` in Markdown, with ratios to the yardstick and shares of the goal."""
     lines = []
     for row in rows:
         numbers = [row.get("failure", ""), "", ""]

@@ -1,9 +1,8 @@
 """How fast the environment runs, with --device cuda on a GPU.
 
-Every round measures each way to step once, one after the other, so what slows the machine down slows all of them; the
-table has the medians of the rounds, and an observation is one row for one step. The yardstick is memcpy of as many
-bytes as the observations have. A TorchRL environment that only counts is measured, too; some of its rows end at every
-step, as in any batch of episodes.
+Every round measures each way to step once, in turn, so what slows the machine down slows all of them; the table has
+medians, and an observation is one row for one step. The yardstick is memcpy of the observations' bytes. A TorchRL
+environment that only counts is measured, too; some of its rows end at every step, as in any batch of episodes.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ MEMCPY = "memcpy"
 TRIVIAL = "trivial environment: "
 LEAN = ", info=False"
 MAX_BUFFER = 2**26
-"""Bytes of observations in the buffers: beyond the caches."""
+"""Bytes of observations in the buffers, beyond the caches."""
 
 
 NamedRuns = Iterator[tuple[str, TimedRun]]
@@ -44,11 +43,11 @@ NamedRuns = Iterator[tuple[str, TimedRun]]
 
 NOISE_BANK = 4096
 SUFFIX = {"off": "", "required": ", kernel"}
-"""What the table says of the ways by the values of ``kernel``."""
+"""Names of ways in the table by ``kernel``."""
 
 
 def configurations() -> dict[str, Task]:
-    """The tasks that are measured: SU is CT-SU-B1, CO is CT-CO-B1 with p = 0.5 and up to ten degrees of rotation."""
+    """The measured tasks: SU is CT-SU-B1, CO is CT-CO-B1 with p = 0.5 and up to ten degrees of rotation."""
     confounding = ct_co_b1()
     confounding = replace(
         confounding,
@@ -64,7 +63,7 @@ def configurations() -> dict[str, Task]:
 class Counter(EnvBase):
     """The trivial environment: it counts to four and starts again.
 
-    A batch starts at 0, 1, 2, 3, 0, ...: rows end at every step, so that TorchRL merges a reset at every step.
+    A batch starts at 0, 1, 2, 3, 0, ..., so that TorchRL merges a reset at every step.
     """
 
     batch_locked = True
@@ -204,7 +203,7 @@ def _single(task: Task, kernel: str) -> NamedRuns:
 
 
 def contenders(num_rows: list[int], names: list[str], with_kernel: bool) -> list[Rung]:
-    """Everything that is measured on the CPU, in the order of the table."""
+    """Everything measured on the CPU, in the table's order."""
     found: list[Rung] = []
 
     def add(configuration: str, n: int, ways: NamedRuns) -> None:

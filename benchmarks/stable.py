@@ -19,7 +19,7 @@ from ctgraph_rl.gym import CTGraphGymEnv
 from ctgraph_rl.sb3 import SB3VecEnv
 
 DEFAULT_ROWS = 8
-"""Rows for Stable-Baselines3's own settings."""
+"""For Stable-Baselines3's own settings."""
 
 KINDS = {"a2c": A2C, "ppo": PPO, "dqn": DQN, "lstm_ppo": RecurrentPPO}
 
@@ -27,7 +27,7 @@ MakeEnv = Callable[[Task, int], VecEnv]
 
 
 def single_envs(task: Task, num_rows: int) -> VecEnv:
-    """Return Stable-Baselines3's own batch of single environments, which are stepped one after the other."""
+    """Return Stable-Baselines3's batch of single environments, stepped in turn."""
 
     def make() -> Env:
         return CTGraphGymEnv(task)
@@ -41,7 +41,7 @@ def batch(task: Task, num_rows: int) -> VecEnv:
 
 
 def ways() -> dict[str, tuple[MakeEnv, bool]]:
-    """Return what is measured: the environments, and whether the hyperparameters are ours."""
+    """Return the environments, and whether the hyperparameters are ours."""
     return {
         "SB3, 256 rows, SB3VecEnv": (batch, True),
         "SB3, 256 rows, make_vec_env": (single_envs, True),
@@ -73,14 +73,14 @@ class Stable:
         self.frames = max(num_rows * getattr(self.model, "n_steps", given["num_steps"]), 1024)
 
     def _exploration(self, given: Mapping[str, Any]) -> Callable[[float], float]:
-        """Return exploration that falls with the frames, not with their share of a call to ``learn``."""
+        """Return exploration that falls with the frames, not with the share of a ``learn`` call."""
         first = given["eps_init"]
         last = given["eps_end"]
         frames = given["annealing_num_steps"]
         return lambda _: max(last, first - (first - last) * self.model.num_timesteps / frames)
 
     def learn(self) -> int:
-        """Learn from one batch, or from several small ones."""
+        """Learn from one batch, or several small ones."""
         before = self.model.num_timesteps
         self.model.learn(self.frames, reset_num_timesteps=False)
         return self.model.num_timesteps - before

@@ -1,4 +1,4 @@
-"""Rules for users' values: every broken rule of an object is named in one error."""
+"""Rules for users' values: one error names all broken rules of an object."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ T = TypeVar("T")
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 Rule = tuple[bool, str]
-"""Whether a rule holds, and the message if it does not."""
+"""Whether a rule holds, and the message if not."""
 
 NamedValues = dict[str, Any]
-"""Values by name, such as settings, a saved state or a line of a log."""
+"""Values by name, such as settings or a saved state."""
 
 ReadOnlyValues = Mapping[str, Any]
 """The same, read-only."""
 
 LARGEST_INT = 2**63 - 1
-"""Of an int64."""
+"""Of int64."""
 
 LONGEST_NAME, LONGEST_PATH = 255, 4095
-"""Bytes of a part of a path, and of a path, that file systems take."""
+"""Bytes of a path's part, and of a path."""
 
 
 def require(*rules: Rule) -> None:
-    """Raise one ``ValueError`` that lists the message of every broken rule.
+    """Raise one ``ValueError`` with the message of every broken rule.
 
     Args:
         rules: pairs of (holds, message); the message names the rule, the value and the fix.
@@ -52,7 +52,7 @@ def require(*rules: Rule) -> None:
 
 
 def nearest(word: str, choices: Iterable[str]) -> str | None:
-    """Return the choice that a misspelt word, its initials or a part of it stand for; None if none is near."""
+    """Return the likely choice for a misspelt word, initials or a part, or None."""
     known = {choice.lower().replace("-", "_"): choice for choice in choices}
     initials = []
     parts = []
@@ -68,7 +68,7 @@ def nearest(word: str, choices: Iterable[str]) -> str | None:
 
 
 def as_int(action: object) -> int:
-    """An integer, -1 for anything else."""
+    """Return an integer, -1 for anything else."""
     try:
         return operator.index(action)  # type: ignore[arg-type]
     except TypeError:
@@ -76,19 +76,19 @@ def as_int(action: object) -> int:
 
 
 def did_you_mean(word: str, choices: Iterable[str]) -> str:
-    """Return the end of a message about a word that is no choice: the nearest choice, or all."""
+    """Return the end of a message about an unknown word: the nearest choice, or all."""
     choices = list(choices)
     near = nearest(word, choices)
     return f"did you mean {near!r}?" if near is not None else f"choices: {', '.join(choices) or 'none'}"
 
 
 def memory_bytes() -> int:
-    """Return the bytes of this machine's memory; a huge number where the system does not say."""
+    """Return this machine's memory in bytes; a huge number if unknown."""
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else sys.maxsize
 
 
 def require_memory(what: str, needed: int, fewer: str) -> None:
-    """Refuse what needs more bytes than the machine's memory has; ``fewer`` says of what to use fewer.
+    """Refuse what needs more bytes than this machine has; ``fewer`` names what to reduce.
 
     Raises:
         ValueError: if the machine has less memory.
@@ -103,17 +103,17 @@ def is_int(value: object, low: float = -math.inf, high: float = math.inf) -> boo
 
 
 def are_ints(value: object, low: float = -math.inf, high: float = math.inf) -> bool:
-    """True for a list or a tuple of what `is_int` is true for."""
+    """True for a list or tuple of such integers."""
     return isinstance(value, (list, tuple)) and all(is_int(each, low, high) for each in value)
 
 
 def repeated(values: Iterable[T]) -> list[T]:
-    """Return the values that are there more than once, each once."""
+    """Return each repeated value once."""
     return [value for value, count in Counter(values).items() if count > 1]
 
 
 def by_name(*named: Any) -> dict[str, Any]:
-    """Return functions or classes by their names."""
+    """Return functions or classes by name."""
     return {each.__name__: each for each in named}
 
 
@@ -128,11 +128,11 @@ def is_real(value: object, low: float = -math.inf, high: float = math.inf) -> bo
 
 
 def plain(value: Any, whole: bool = False) -> Any:
-    """Return numbers and arrays of NumPy, torch and other libraries as Python's own; anything else unchanged.
+    """Return numbers and arrays of NumPy, torch and others as Python's own; anything else unchanged.
 
     Args:
         value: a number, an array, or a list, tuple or dict of such.
-        whole: return a float without a fraction as an int, as ``1e5`` on the command line is one.
+        whole: return a whole float, such as ``1e5``, as an int.
     """
     try:
         return _plain(value, whole)
@@ -161,7 +161,7 @@ def _plain(value: Any, whole: bool) -> Any:
 
 
 def make_fields_plain(instance: Any) -> None:
-    """Make the numbers and arrays in the fields of a frozen dataclass `plain`, and lists given for a tuple tuples."""
+    """Make a frozen dataclass's numbers and arrays `plain`, and lists for tuples tuples."""
     for each in fields(instance):
         if each.init:
             value = plain(getattr(instance, each.name), whole=_is_whole(each.type))
@@ -171,7 +171,7 @@ def make_fields_plain(instance: Any) -> None:
 
 
 def takes_numbers(function: Function) -> Function:
-    """Give a function `plain` numbers for arguments that are annotated as numbers and those of ``**``."""
+    """Give a function `plain` numbers for ``**`` and arguments annotated as numbers."""
     parameters = signature(function).parameters
     names = list(parameters)
     wholes = {name: _is_whole(each.annotation) for name, each in parameters.items() if _is_number(each)}
@@ -199,11 +199,11 @@ KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "Sequence": ("a list", lambda value: isinstance(as_tuple(value), tuple)),
     "None": ("null", lambda value: value is None),
 }
-"""By the names in annotations, what a value must be in words, and whether it is."""
+"""By names in annotations: a value's kind in words, and its test."""
 
 
 def takes_its_kinds(function: Function) -> Function:
-    """As `takes_numbers`, and refuse values of other kinds than are annotated with names of `KINDS`."""
+    """As `takes_numbers`, and refuse values of other kinds than annotations in `KINDS`."""
     shape = signature(function)
     checked = {}
     for name, parameter in shape.parameters.items():
@@ -227,7 +227,7 @@ def takes_its_kinds(function: Function) -> Function:
 
 
 class TakesNumbers:
-    """The base of classes whose constructors take numbers of NumPy and torch, too."""
+    """Base of classes whose constructors also take numbers of NumPy and torch."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -253,7 +253,7 @@ def as_path(name: str, value: object) -> Path:
     """Return a path that a file system can take.
 
     Raises:
-        ValueError: for what is no path, has a null character, or is too long.
+        ValueError: for other values, null characters, and too long paths.
     """
     require((isinstance(value, (str, os.PathLike)), f"{name} must be a path, got {value!r:.80}"))
     path = Path(value)  # type: ignore[arg-type]
@@ -277,7 +277,7 @@ def is_json_object(value: object) -> bool:
 
 
 def is_shallow(value: object, levels: int) -> bool:
-    """True for a value of JSON with at most so many lists and objects within each other."""
+    """Return whether a JSON value nests at most so many lists and objects."""
     if not isinstance(value, (dict, list)):
         return True
     items = value.values() if isinstance(value, dict) else value
@@ -298,7 +298,7 @@ def _rules(holds: Callable[[Any], bool], what: str, values: Mapping[str, object]
 
 
 def at_most(limit: float, **values: object) -> list[Rule]:
-    """Rules that each named number is no larger than a limit; what is no number breaks other rules."""
+    """Rules that each named number is at most a limit; other values break other rules."""
     return _rules(lambda value: not is_real(value) or value <= limit, f"at most {limit:,}", values)
 
 
@@ -328,7 +328,7 @@ def true_or_false(**values: object) -> list[Rule]:
 
 
 def as_tuple(value: object) -> object:
-    """A list-like value as a tuple of plain values (yaml has only lists); anything else unchanged."""
+    """A list-like value, as of yaml, as a tuple of plain values; anything else unchanged."""
     value = plain(value)
     if isinstance(value, (list, tuple)):
         return tuple(value)
@@ -338,10 +338,10 @@ def as_tuple(value: object) -> object:
 
 
 def require_all(kind: type[T], name: str, values: object) -> tuple[T, ...]:
-    """The items of a list-like value, all of one kind.
+    """The items, at least one, of a list-like value, all of one kind.
 
     Raises:
-        ValueError: for anything else, or no item.
+        ValueError: for anything else.
     """
     items = as_tuple(values)
     holds = isinstance(items, tuple) and len(items) > 0 and all(isinstance(item, kind) for item in items)

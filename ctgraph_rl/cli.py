@@ -19,7 +19,7 @@ from ctgraph_rl.packages import check_packages, conf_dir
 
 
 class Command(NamedTuple):
-    """A command: the module whose ``main`` it is, which is imported when it is called, and a line about it."""
+    """A command: the module of its ``main``, imported when called, and a line about it."""
 
     module: str
     about: str
@@ -46,7 +46,7 @@ COMMANDS = {
     "submit": Command("ctgraph_rl.board.submit", "make a submission of runs, a folder that others can check"),
     "verify": Command("ctgraph_rl.board.verify", "check a submission by its files, reruns and held-out seeds"),
 }
-"""Commands by name, each with its module and a line about it."""
+"""By name, each with its module and a line."""
 
 SETTINGS = {
     "curriculum=NAME": "what is learned; ctgraph-rl curricula lists them",
@@ -56,7 +56,7 @@ SETTINGS = {
     "curriculum.num_frames=1e5": "environment steps of each task",
     "agent.learning_rate=1e-3": "a hyperparameter of the agent",
 }
-"""Settings of a run that are often changed, each with a line about it."""
+"""Settings that are often changed, each with a line."""
 
 PARTS = {
     **{part: f"curricula {part}" for part in ("describe", "list", "probabilities")},
@@ -65,7 +65,7 @@ PARTS = {
     "sweep": "-m",
     **{option: f"--{option}" for option in ("help", "version")},
 }
-"""Words that are no commands but part of one, options, or what other programs call one."""
+"""Parts of commands, options, and other programs' names of commands."""
 
 USAGE = """usage: ctgraph-rl COMMAND ...         each command has --help
        ctgraph-rl SETTING=VALUE ...    one run, such as ctgraph-rl curriculum=su_b1_4tasks agent=dqn
@@ -85,11 +85,11 @@ options:
   --hydra-help   show the options that Hydra adds to a run"""
 
 FULL_COLLECTIONS = 100
-"""Collections of the middle generation between two full ones; Python's default is 10."""
+"""Middle collections between two full ones; Python's default is 10."""
 
 
 def main() -> None:
-    """``ctgraph-rl COMMAND ...`` for one of `COMMANDS`; settings alone are for `ctgraph_rl.run`."""
+    """Run one of `COMMANDS`, or with settings only `ctgraph_rl.run`."""
     with quiet_where_nobody_reads():
         _call()
 
@@ -118,7 +118,7 @@ def command(module: str) -> Callable[[], None]:
     """Return the ``main`` of a module of this package, of `curricula` or of `baselines`.
 
     Raises:
-        ValueError: see `check_packages`.
+        ValueError: as `check_packages`.
     """
     if not module.startswith("ctgraph_rl."):
         check_packages()
@@ -138,8 +138,8 @@ def _start(module: str) -> None:
 def first_imports() -> Iterator[None]:
     """Pause garbage collection while torch is imported for the first time, and leave its objects out of later ones.
 
-    A full collection visits the 300,000 objects of torch, none of which is garbage, and there are several in an import.
-    Later full collections are ten times as rare: what `torch.compile` makes takes 0.3 s to visit and lasts, too.
+    A full collection visits torch's 300,000 objects, without garbage, several times in an import. Later full
+    collections are ten times as rare: the objects of `torch.compile` take 0.3 s to visit and last, too.
     """
     pauses = gc.isenabled() and "torch" not in sys.modules
     if pauses:
@@ -155,7 +155,7 @@ def first_imports() -> Iterator[None]:
 
 
 def usage() -> str:
-    """Return what ``ctgraph-rl`` without arguments prints."""
+    """Return the text of ``ctgraph-rl`` without arguments."""
     commands = {name: each.about for name, each in COMMANDS.items()}
     return USAGE.format(commands=_table(commands), settings=_table(SETTINGS))
 
@@ -166,7 +166,7 @@ def _table(lines: Mapping[str, str]) -> str:
 
 
 def versions() -> str:
-    """Return the version of this package and of what decides the numbers of a run; none of them is imported."""
+    """Return the versions of this package and of what decides a run's numbers, without importing them."""
     others = ", ".join(f"{name} {version(name)}" for name in ("torch", "torchrl", "hydra-core"))
     return f"ctgraph_rl {__version__} ({others})"
 

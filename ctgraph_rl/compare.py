@@ -32,13 +32,13 @@ PARTS = {
     TOGETHER: ("together",),
     "machine": ("machine", "num_threads", "cpu"),
 }
-"""Keys of a log's first line by what they say; all others, but for the settings, say what the code was."""
+"""Keys of a log's first line by meaning; others, but for settings, are code."""
 
 LogLine = ReadOnlyValues
 
 
 class Compared(NamedTuple):
-    """The result of a comparison: an exit code and the lines to print."""
+    """An exit code and lines to print."""
 
     code: int
     lines: list[str]
@@ -48,9 +48,7 @@ def compare(one: Path, other: Path, bound: float = BOUND) -> Compared:
     """Compare two run directories, finished or not.
 
     Args:
-        one: the first directory.
-        other: the second.
-        bound: see `ctgraph_rl.parsers.BOUND`.
+        bound: as `ctgraph_rl.parsers.BOUND`.
 
     Raises:
         ValueError: for a directory without a run, and a log or weights that cannot be read.
@@ -132,7 +130,7 @@ def _verdict(found: Sequence[Sequence[LogLine]], bound: float) -> tuple[int, str
 
 
 def _is_rounding(one: LogLine, other: LogLine, bound: float, scale: Mapping[str, float]) -> bool:
-    """Return whether the fields of two lines differ by no more than rounding; counts must be equal."""
+    """Return whether two lines differ by rounding only; counts must be equal."""
     for key in _differing(one, other):
         first = one.get(key)
         second = other.get(key)
@@ -144,7 +142,7 @@ def _is_rounding(one: LogLine, other: LogLine, bound: float, scale: Mapping[str,
 
 
 def _differing(one: ReadOnlyValues, other: ReadOnlyValues) -> list[str]:
-    """Return the keys whose values differ; None where a side lacks one."""
+    """Return the keys whose values differ or that a side lacks."""
     return [key for key in {**one, **other} if one.get(key) != other.get(key)]
 
 
@@ -196,7 +194,7 @@ def _same(one: Any, other: Any) -> bool:
 
 
 def _parts(line: LogLine) -> dict[str, NamedValues]:
-    """Return what a log's first line says of settings, curriculum, code and machine, by name."""
+    """Return a first line's settings, curriculum, code and machine, by name."""
     left = dict(line)
     for key in ("kind", "seconds", "config"):
         left.pop(key, None)

@@ -28,13 +28,13 @@ from ctgraph_rl.tasks.task import Task, are_graphs, ct_graphs
 from ctgraph_rl.tasks.values import open_loop_ceiling, random_frames_to_goal
 
 AGENT, FRAMES_PER_SECOND = "lstm_ppo", 18_000
-"""An agent of this package and its rough speed on one core, for estimates of time."""
+"""An agent and its rough speed on one core, for estimates."""
 
 SECONDS_OF_AN_ID = 4e-8
-"""Further seconds a frame for each number of a one-hot task id, which the agent reads, too."""
+"""Further seconds a frame per number of a one-hot task id."""
 
 SECONDS_OF_A_STEP, SECONDS_OF_A_ROW = 5e-3, 1.3e-5
-"""What a step of an evaluation takes of this agent: in all, and for each episode that is played at once."""
+"""Time of this agent's evaluation step: in all, and per parallel episode."""
 
 UNKNOWN = "-"
 
@@ -69,7 +69,7 @@ NOISE_AS_DICE = (
 )
 NEEDS_MEMORY = "Memory is needed: a deterministic agent without it, as in greedy evaluation, reaches at most, in"
 MOST_LOST = 4
-"""Tasks that a note names."""
+"""Most tasks in a note."""
 
 SAME_DECISIONS = "although decision states look alike, as all decisions on the way to the goal are the same."
 
@@ -81,7 +81,7 @@ OBSERVATION_NOTES = (
 )
 
 TABLE_2 = ((2, 1, 0.0), (2, 2, 0.9), (3, 2, 0.9), (2, 4, 0.9), (3, 10, 0.9), (2, 16, 0.5))
-"""b, d and p of the rows of the paper's Table 2."""
+"""b, d and p of Table 2's rows."""
 
 MISPRINTS = (
     "The paper prints P_E as 7.40e-2 (row 1) and 1.99e-15 (row 6), both cut, and as 4.78e-5 (row 2), a misprint."
@@ -89,20 +89,18 @@ MISPRINTS = (
 
 
 def memory(curriculum: Curriculum) -> tuple[int, int]:
-    """Bytes of the image bank of a curriculum's tasks, and of each row: two observations, as a step holds."""
+    """Bytes of a curriculum's image bank, and of each row's two observations."""
     tasks = _graphs(curriculum)
     one = max(math.prod(task.images.shape) for task in tasks)
     return bank_bytes(tasks), 2 * one
 
 
 def describe(curriculum: Curriculum, frames_per_second: float | None = None) -> list[Sheet]:
-    """The curriculum at large, its blocks, and the difficulty, ceilings and observability of its tasks.
-
-    Of tasks that are no CT-graphs, only the first two are known.
+    """The curriculum at large, its blocks and, for CT-graphs, its tasks' difficulty, ceilings and observability.
 
     Args:
         curriculum: any curriculum.
-        frames_per_second: the rate that the estimated time is for; None: that of `AGENT`.
+        frames_per_second: for the estimated time; None: that of `AGENT`.
 
     Raises:
         ValueError: for a rate that is not above 0.
@@ -138,7 +136,7 @@ def _graphs(curriculum: Curriculum) -> Sequence[Task]:
 
 
 def _time(curriculum: Curriculum, frames_per_second: float | None) -> str:
-    """Return how long learning takes at a rate; None: at the rate of `AGENT`, which is then named."""
+    """Return how long learning takes at a rate; None: at that of `AGENT`, which is named."""
     if frames_per_second is not None:
         return f"{_duration(curriculum.num_frames / frames_per_second)} at {frames_per_second:,.0f} frames/s"
     protocol = curriculum.protocol
@@ -176,7 +174,7 @@ def protocol_in_words(protocol: Protocol, num_tasks: int) -> str:
 
 
 def evaluation_in_words(evaluation: Evaluation) -> str:
-    """When and how performance is measured."""
+    """Return an evaluation in words."""
     how = "greedy" if evaluation.greedy else "sampled"
     in_row = f", {evaluation.episodes_per_row} in a row" if evaluation.episodes_per_row > 1 else ""
     moments = [
@@ -217,7 +215,7 @@ def _other_blocks(curriculum: Curriculum) -> Sheet:
 
 
 def _block_rows(number: int, block: Block, labels: Mapping[TaskLike, str]) -> Iterator[tuple[str, ...]]:
-    """A row for each different task; what is of the whole block stands in the first."""
+    """A row per different task; the first has the block's facts."""
     name = str(number)
     frames = f"{block.num_frames:,}"
     switch = "" if block.switch is None else repr(block.switch)
@@ -300,7 +298,7 @@ def _labelled(curriculum: Curriculum) -> Iterator[tuple[Task, str]]:
 
 
 def probabilities() -> Sheet:
-    """Return Table 2 of the paper as the formulas give it, and which printed numbers are others."""
+    """Return Table 2 of the paper by its formulas, with the printed numbers that differ."""
     rows = []
     for b, d, p in TABLE_2:
         graph = CTGraph(b, d, p)
@@ -333,7 +331,7 @@ def own_curricula(config_dir: Path) -> list[Curriculum]:
     """Return the curricula of a configuration directory.
 
     Raises:
-        ValueError: see `ctgraph_rl.runs.config.curriculum_of`.
+        ValueError: as `ctgraph_rl.runs.config.curriculum_of`.
     """
     return [curriculum_of(name, config_dir) for name in curriculum_names(config_dir)]
 
@@ -351,10 +349,10 @@ def find_curriculum(name: str, config_dir: Path | None) -> Curriculum:
 def write(
     curriculum: Curriculum, figure: Path | None = None, similarity: Path | None = None, json: Path | None = None
 ) -> None:
-    """Write a figure of the graphs and goals, one of how alike the tasks are, and the curriculum as JSON, where named.
+    """Write figures of graphs and goals and of similarity, and the curriculum as JSON, where named.
 
     Raises:
-        ValueError: for a format that figures do not have, and a JSON file that exists.
+        ValueError: for other formats of figures, and a JSON file that exists.
     """
     if figure is not None:
         draw_graphs(curriculum, figure)

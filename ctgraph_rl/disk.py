@@ -1,8 +1,7 @@
 """Files in directories that others may have made: written whole and never through a link, read within limits.
 
-Every file of the package is written here. A file is written beside its place and renamed, so what was there, a link
-too, is replaced and not followed. Folders that the package names itself are refused where they are links. A
-name that the user gives, such as ``--csv FILE``, is followed: `write_named`.
+Every file of the package is written here, beside its place, and renamed, so that a link is replaced and not followed.
+Folders that the package names are refused where they are links. `write_named` follows names that the user gives.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from typing import BinaryIO
 from ctgraph_rl.checks import require
 
 PART = ".part"
-"""Ending of a file that is being written."""
+"""Ending of an unfinished file."""
 
 
 def write_whole(path: str | os.PathLike[str], content: bytes | str, synced: bool = True) -> None:
@@ -29,11 +28,11 @@ def write_whole(path: str | os.PathLike[str], content: bytes | str, synced: bool
 
     Args:
         path: the file.
-        content: bytes, or text that is written in UTF-8.
-        synced: whether it must be there after a power cut; False for what no run is resumed from.
+        content: text is written in UTF-8.
+        synced: whether it must survive a power cut; False for what no run resumes from.
 
     Raises:
-        OSError: if it cannot be written; names the path and the bytes needed and free. The old file stays.
+        OSError: if it cannot be written, with path and bytes needed and free. The old file stays.
     """
     path = Path(path)
     part = path.with_name(path.name + PART)
@@ -53,12 +52,12 @@ def write_whole(path: str | os.PathLike[str], content: bytes | str, synced: bool
 
 
 def is_writable(folder: Path | str) -> bool:
-    """Return whether files can be made in a folder; never on a read-only file system."""
+    """Return whether files can be made in a folder."""
     return os.access(folder, os.W_OK)
 
 
 def publish(made: Path, path: Path) -> None:
-    """Move a finished file of the same file system to its place, so that after a power cut it is there whole, or not.
+    """Move a finished file within a file system, so that after a power cut it is whole or absent.
 
     Raises:
         OSError: if it cannot be synced or moved.
@@ -70,7 +69,7 @@ def publish(made: Path, path: Path) -> None:
 
 
 def write_named(path: Path | str, content: bytes | str) -> None:
-    """Write a file that the user has named: where a link, a pipe or a device is, the content goes through it.
+    """Write a file that the user has named, also through a link, pipe or device.
 
     Raises:
         OSError: if it cannot be written.
@@ -83,7 +82,7 @@ def write_named(path: Path | str, content: bytes | str) -> None:
 
 
 def cannot_write(path: Path, num_bytes: int, error: OSError) -> OSError:
-    """The error for a file that cannot be written, with sizes."""
+    """The error, with sizes, for a file that cannot be written."""
     try:
         free = f"{shutil.disk_usage(path.parent).free / 1e6:.1f} MB are free"
     except OSError:
@@ -92,7 +91,7 @@ def cannot_write(path: Path, num_bytes: int, error: OSError) -> OSError:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names in a folder last: new, moved and removed ones; where a file system can sync folders."""
+    """Make a folder's new, moved and removed names last, where a file system can."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:
@@ -108,7 +107,7 @@ def sync_folders(folder: Path) -> None:
 
 
 def make_folder(folder: Path) -> Path:
-    """Make a folder that the package names itself, unless it is there.
+    """Make a folder that the package names, unless it exists.
 
     Raises:
         ValueError: if a link is there.
@@ -121,7 +120,7 @@ def make_folder(folder: Path) -> Path:
 
 
 def require_new(path: Path) -> None:
-    """Refuse to make a folder where something is.
+    """Refuse an existing path.
 
     Raises:
         FileExistsError: if something is there.
@@ -132,10 +131,10 @@ def require_new(path: Path) -> None:
 
 @contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
-    """Make a folder that is there whole, or not at all: it is filled beside its place and then renamed.
+    """Make a folder whole or not at all: it is filled beside its place and renamed.
 
     Args:
-        path: the folder; must not exist.
+        path: must not exist.
 
     Raises:
         FileExistsError: if something is there.
@@ -156,7 +155,7 @@ def new_folder(path: Path) -> Iterator[Path]:
 
 
 def require_no_link(path: Path) -> None:
-    """Refuse a symbolic link that might lead out of a directory.
+    """Refuse a symbolic link.
 
     Raises:
         ValueError: if there is one.
@@ -166,14 +165,10 @@ def require_no_link(path: Path) -> None:
 
 
 def open_own(path: Path, mode: str) -> BinaryIO:
-    """Open a file to change it in place, unbuffered.
-
-    Args:
-        path: the file.
-        mode: as of `open`, binary.
+    """Open a file to change it in place, unbuffered; ``mode`` is of `open`, binary.
 
     Raises:
-        ValueError: for a symbolic link, a file with a second name elsewhere, and what is no regular file.
+        ValueError: for a symbolic link, a file with a second name, and other than regular files.
     """
     require_no_link(path)
     rule = f"{path} must be a regular file without another name, as hard links are; remove it"
@@ -197,7 +192,7 @@ def appending(path: Path, known: os.stat_result) -> Iterator[int]:
 
     Args:
         path: the file.
-        known: what it was found to be; what is appended to another would be lost.
+        known: its earlier state; another file is refused.
 
     Raises:
         FileNotFoundError: if it was moved, removed or replaced.
@@ -217,25 +212,21 @@ def appending(path: Path, known: os.stat_result) -> Iterator[int]:
 
 
 def append_line(path: Path, value: object) -> None:
-    """Add a value to a file of JSON lines."""
+    """Append a value to JSON lines."""
     with open_own(path, "ab") as file:
         file.write(json.dumps(value).encode() + b"\n")
 
 
 def read_text(path: str | os.PathLike[str], most: int) -> str:
-    """Return `read_regular` as text, with a mark for what is not UTF-8."""
+    """Return `read_regular` as text, marking bytes that are not UTF-8."""
     return read_regular(path, most).decode("utf-8", "replace")
 
 
 def read_regular(path: str | os.PathLike[str], most: int) -> bytes:
-    """Return the content of a regular file; a pipe or a device is not opened.
-
-    Args:
-        path: the file, or a link to it.
-        most: bytes that it may have.
+    """Return the content of a regular file, also by a link; pipes and devices are not opened.
 
     Raises:
-        ValueError: for a larger file, and what is no regular file.
+        ValueError: for more than ``most`` bytes, and other than regular files.
         OSError: if it cannot be read.
     """
     with open(path, "rb", opener=_opener(os.O_NONBLOCK)) as file:

@@ -33,16 +33,16 @@ RowData = dict[str, Tensor]
 
 
 class CTGraphEnv(EnvBase):
-    """A batch of CT-graphs, ``batch_size=[len(tasks)]``; every row has its own task.
+    """A batch of CT-graphs, ``batch_size=[len(tasks)]``, with a task per row.
 
     A row's trajectory depends only on seed, row number and actions: rows 4..7 of eight equal a batch of four with
-    ``first_row=4``. Rows may differ in all of `Task` but the kind and size of observations.
+    ``first_row=4``. Tasks may differ in all but kind and size of observations.
 
     Observation keys, for N rows:
 
     - ``observation``: uint8 [N, 1, r, r], or [N, K] when one-hot.
     - ``is_init``: bool [N, 1], True at the first observation of an episode.
-    - ``step_count``: int64 [N, 1], steps of the episode. It reveals the phase: no policy should read it.
+    - ``step_count``: int64 [N, 1], steps of the episode. No policy should read it: it reveals the phase.
     - ``episode_reward``: float32 [N, 1], sum of the episode's rewards.
     - ``outcome``: uint8 [N, 1]: 0 running, 1 fail, 2 another end state, 3 the goal.
     - ``leaf``: int64 [N, 1], the end state reached, else -1.
@@ -51,27 +51,26 @@ class CTGraphEnv(EnvBase):
     float32 [N, 1], paid on entering an end or fail state. These are terminal, as in the paper; ``truncated`` is always
     False (TorchRL's ``StepCounter`` adds a time limit).
 
-    For tests and analysis, never in the data: ``state_type``, ``node``, ``goal_leaf``, ``observation_id``. For
-    planners, `get_state` and ``reset(TensorDict(state=...), set_state=True)`` save and restore rows.
+    For tests and analysis, not in the data: ``state_type``, ``node``, ``goal_leaf``, ``observation_id``. For planners,
+    `get_state` and ``reset(TensorDict(state=...), set_state=True)`` save and restore rows.
 
     Args:
         tasks: one task per row; ``[task] * 512`` trains on one task.
         seed: decides all that is random in the rows, in [0, 2**63).
         first_row: number of the first row, for a batch that is split.
-        task_pool: the tasks that `set_tasks` may be given; specs and images are fixed by it. Default: ``tasks``.
-        device: where the tensors live.
-        check_actions: refuse actions of a wrong shape, dtype or range, and steps of finished rows. False trusts them;
-            on a GPU the check waits for the device at every step.
-        noise_bank: 0, or from how many noises drawn in advance an observation takes its own: see `Rows`.
+        task_pool: tasks that `set_tasks` takes; it fixes specs and images. Default: ``tasks``.
+        check_actions: refuse actions of a wrong shape, dtype or range, and steps of finished rows. On a GPU the check
+            waits for the device at every step.
+        noise_bank: 0, or the number of noises drawn in advance, as in `Rows`.
         task_ids: the id of each task, an integer >= 0. Observations then have ``task_id``, uint8 [N, num_task_ids]: the
             row's id as one-hot, zeros for a task without one.
         num_task_ids: length of ``task_id``; None: just enough.
-        kernel: ``"auto"``, ``"off"`` or ``"required"``, whether the C kernel takes the steps: see `Rows`.
+        kernel: ``"auto"``, ``"off"`` or ``"required"``, as in `Rows`.
         info: False leaves out ``step_count``, ``episode_reward``, ``outcome``, ``leaf`` and ``truncated``, so that
             TorchRL copies less.
 
     Raises:
-        ValueError: for no tasks, values out of range, observations of different shapes, and what a required kernel
+        ValueError: for no tasks, values out of range, different shapes of observations, and what a required kernel
             cannot run.
 
     Example:
@@ -128,15 +127,15 @@ class CTGraphEnv(EnvBase):
         return self.rows.tasks
 
     def set_tasks(self, tasks: Iterable[Task], at_episode_end: bool = False) -> None:
-        """Give every row a task of the pool, now or at the end of its episode: see `Rows.set_tasks`."""
+        """Give every row a task of the pool, now or at its episode's end, as `Rows.set_tasks`."""
         self.rows.set_tasks(tasks, at_episode_end)
 
     def switch_tasks(self, tasks: Iterable[Task], switch: Switch, at_episode_end: bool = False) -> None:
-        """Let rows change between tasks from episode to episode: see `Rows.switch_tasks`."""
+        """Let rows change between tasks by the episode, as `Rows.switch_tasks`."""
         self.rows.switch_tasks(tasks, switch, at_episode_end)
 
     def set_goals(self, goals: Iterable[Goal] | Tensor) -> None:
-        """Give every row a goal: see `Rows.set_goals`. The outcome of an episode follows from the goal at its end."""
+        """Give every row a goal, as `Rows.set_goals`. An episode's outcome follows from its last goal."""
         self.rows.set_goals(goals)
 
     @property
@@ -146,12 +145,12 @@ class CTGraphEnv(EnvBase):
 
     @property
     def node(self) -> Tensor:
-        """The heap index of each row's position in the tree, int64 [N]."""
+        """Each row's heap index in the tree, int64 [N]."""
         return self.rows.node.clone()
 
     @property
     def goal_leaf(self) -> Tensor:
-        """The number of each row's end state with the goal, int64 [N]."""
+        """Each row's end state with the goal, int64 [N]."""
         return self.rows.goal_leaf.clone()
 
     @property
@@ -166,12 +165,12 @@ class CTGraphEnv(EnvBase):
 
     @property
     def swap(self) -> Swap | None:
-        """The swapped branches of each row's tree; None for no row."""
+        """The rows' swapped branches; None for no row."""
         return self.rows.params.tree.swap
 
     @property
     def first_leaf(self) -> Tensor:
-        """Heap index of each row's first end state, int64 [N]: ``node - first_leaf`` is the number of an end state."""
+        """Heap index of each row's first end state, int64 [N]; ``node - first_leaf`` numbers end states."""
         return self.rows.params.tree.first_leaf
 
     @property
@@ -185,10 +184,10 @@ class CTGraphEnv(EnvBase):
         return self.rows.uses.max_depth
 
     def get_state(self) -> TensorDict:
-        """A copy of the rows' states, to go back to with ``reset(TensorDict(state=state), set_state=True)``.
+        """A copy of the rows' states for ``reset(TensorDict(state=state), set_state=True)``.
 
-        It holds the hidden Markov state, which no policy may see. Its rows may be put in any order; their further
-        randomness is that of their row numbers. With a ``_reset`` mask, give a clone: TorchRL writes into it.
+        It holds the hidden Markov state, which no policy may see. Rows may be reordered; their randomness follows their
+        row numbers. With a ``_reset`` mask, give a clone: TorchRL writes into it.
         """
         fields = {field: value.clone() for field, value in self.rows.state._asdict().items()}
         return TensorDict(fields, batch_size=self.batch_size, device=self.device)
@@ -208,7 +207,7 @@ class CTGraphEnv(EnvBase):
         return self._tensordict(self._data(shown.observation, shown.done.unsqueeze(-1), is_init.unsqueeze(-1), shown))
 
     def _read_state(self, tensordict: TensorDictBase | None, mask: Tensor | None) -> RowState:
-        """The state to go back to in the rows of a mask; refuses what no state of the rows' trees can be."""
+        """Return the state to restore in a mask's rows; refuse states that their trees lack."""
         given = TensorDict() if tensordict is None else tensordict.get("state", TensorDict())
         complete = set(RowState._fields) <= set(given.keys())
         require((complete, "set_state=True needs the rows' state under 'state', as get_state() gives it"))
@@ -237,7 +236,7 @@ class CTGraphEnv(EnvBase):
         return self._tensordict(self.step_data(tensordict.get("action", None), mask))
 
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        """The standard method with equal data, without asking whether any row is done and without a merge."""
+        """The standard method with equal data, without asking whether rows are done and without a merge."""
         if "_step" in tensordict:
             return super()._step_and_maybe_reset(tensordict)
         tensordict = self.step(tensordict.to(self.device) if tensordict.device != self.device else tensordict)
@@ -275,21 +274,21 @@ class CTGraphEnv(EnvBase):
         return self._keep_steps(super()._rollout_stop_early(**kwargs))
 
     def _keep_steps(self, steps: list[TensorDictBase]) -> list[TensorDictBase]:
-        """Keep the steps for `rollout`, which stacks them itself; return what the stock method stacks."""
+        """Keep the steps, which `rollout` stacks; return what the stock method stacks."""
         if self._steps is None:
             return steps
         self._steps.extend(steps)
         return [step.empty() for step in steps[:1]]
 
     def step_data(self, action: Tensor | None, mask: Tensor | None = None) -> RowData:
-        """Step all rows; return the data after the step by key, ``reward`` among them.
+        """Step all rows; return the data after the step by key, with ``reward``.
 
-        Values may share memory with each other and with the rows' state: do not write into them.
+        Values may share memory with each other and the rows' state: do not write into them.
 
         Args:
             action: int64 [N].
-            mask: bool [N], TorchRL's ``_step``: the rows to step, None: all. The others stay unchanged, draw nothing
-                and have reward 0.
+            mask: bool [N], TorchRL's ``_step``: the rows to step. Others stay unchanged, draw nothing and have reward
+                0.
 
         Raises:
             ValueError: for actions that ``check_actions`` refuses.
@@ -308,7 +307,7 @@ class CTGraphEnv(EnvBase):
         return data
 
     def step_and_restart_data(self, action: Tensor | None) -> tuple[RowData, RowData]:
-        """Return `step_data`, and `restart_data` for the rows that are done; on CPUs in one call of the kernel."""
+        """Return `step_data`, and `restart_data` for done rows; on CPUs in one call of the kernel."""
         rows = self.rows
         stepped = None
         if rows.uses_kernel and not rows.tasks_change:
@@ -326,7 +325,7 @@ class CTGraphEnv(EnvBase):
         return after, self._restart_data(shown.following, done, self._running)
 
     def restart_data(self, done: Tensor, observation: Tensor) -> RowData:
-        """Start an episode in the rows that are done; return the data that the next step starts from by key.
+        """Start an episode in done rows; return the data that the next step starts from.
 
         Args:
             done: bool [N, 1], after the last step.
@@ -335,7 +334,7 @@ class CTGraphEnv(EnvBase):
         return self._restart_data(self.rows.restart(done.squeeze(-1), observation), done, self._not_done())
 
     def _data(self, observation: Tensor, done: Tensor, is_init: Tensor, shown: Shown | Stepped) -> RowData:
-        """Return the rows' data by key, all but rewards; ``shown`` says where the rows that are done arrived."""
+        """Return the rows' data but rewards; ``shown`` has the arrivals of done rows."""
         data = {"observation": observation, "is_init": is_init, "done": done, "terminated": done}
         if self.info:
             ends = {"outcome": shown.outcome.unsqueeze(-1), "leaf": shown.leaf.unsqueeze(-1)}
@@ -346,7 +345,7 @@ class CTGraphEnv(EnvBase):
         return {"observation": observation, "is_init": is_init, **running, **self._counts(self.rows)}
 
     def _not_done(self) -> RowData:
-        """Make what rows show that are not done, [N, 1] by key."""
+        """Make the data of rows that are not done, [N, 1]."""
         false = torch.zeros_like(self.rows.row, dtype=torch.bool).unsqueeze(-1)
         data = {"done": false, "terminated": false}
         if self.info:
@@ -377,7 +376,7 @@ class CTGraphEnv(EnvBase):
         TorchRL's ``PixelRenderTransform`` and ``VideoRecorder`` make videos of it.
 
         Args:
-            size: height in pixels, at least 48.
+            size: height, at least 48.
 
         Returns:
             uint8 [N, size, 2 * size, 3] on the CPU.
@@ -395,11 +394,11 @@ class CTGraphEnv(EnvBase):
 
 
 _SHARED = ("terminated", "step_count", "episode_reward", "reward", "task_id", TASK_NUMBER)
-"""Data of rows whose memory is also that of other data or of the rows."""
+"""Data that may share memory."""
 
 
 def _own(data: RowData) -> RowData:
-    """Return data that may be written into: their memory is their own."""
+    """Return data with separate memory, to be written into."""
     return {key: value.clone() if key in _SHARED else value for key, value in data.items()}
 
 

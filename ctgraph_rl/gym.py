@@ -1,7 +1,6 @@
 """CT-graphs as Gymnasium environments: a single one, and a batch with all three autoreset modes.
 
-Importing this module registers the ids ``ctgraph/CTGraph-v0``, ``ctgraph/CT-FO-B1-v0`` and so on;
-``gymnasium.make("ctgraph_rl.gym:ctgraph/CT-SU-B1-v0")`` imports and makes in one.
+``gymnasium.make("ctgraph_rl.gym:ctgraph/CT-SU-B1-v0")`` imports this module, which registers the ids.
 """
 
 from __future__ import annotations
@@ -39,23 +38,21 @@ _RENDERING: NamedValues = {"render_modes": ["rgb_array", "ansi"], "render_fps": 
 class CTGraphGymEnv(gymnasium.Env[Any, int]):
     """One CT-graph.
 
-    Observations are uint8 [1, r, r], or [K] when one-hot; action 0 waits and 1..b decides. Episodes end by themselves:
-    ``truncated`` is always False. ``info`` holds
+    Observations are uint8 [1, r, r], or [K] when one-hot; action 0 waits and 1..b decides; ``truncated`` is always
+    False. ``info`` holds
 
     - ``task``: the number of the task in ``task_pool``,
     - ``outcome``: 0 running, 1 fail, 2 another end state, 3 the goal,
     - ``leaf``: the number of the end state arrived at, else -1.
 
     Args:
-        task: see `make_task`, as for ``config`` and ``changes``.
-        config: see `make_task`.
-        task_pool: the tasks that `set_task` may be given. Default: only the task.
+        task: as in `make_task`, also ``config`` and ``changes``.
+        task_pool: tasks that `set_task` takes. Default: only the task.
         task_ids: the id of each task of the pool, such as ``curriculum.task_ids``. Observations are then a dict of
             ``observation`` and ``task_id``, uint8 [num_task_ids]: the id as one-hot.
         num_task_ids: length of ``task_id``; None: just enough.
         render_mode: ``rgb_array``, ``ansi`` or None.
-        kernel: ``"auto"``, ``"off"`` or ``"required"``, whether the C kernel takes the steps: see `Rows`.
-        changes: see `make_task`.
+        kernel: ``"auto"``, ``"off"`` or ``"required"``, as in `Rows`.
 
     Raises:
         ValueError: for values out of range.
@@ -93,7 +90,7 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
         self._is_over = True
 
     def set_task(self, task: Task) -> None:
-        """Change to another task of the pool at the next reset."""
+        """Change to a task of the pool at the next reset."""
         (self._next_number,) = find_numbers(self.task_pool, [task])
 
     @torch.inference_mode()
@@ -103,7 +100,7 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
 
         Args:
             seed: start the random stream of (seed, row 0), in [0, 2**63); None: continue the present one.
-            options: without use.
+            options: unused.
         """
         require(_seed_rule(seed))
         super().reset(seed=seed)
@@ -143,7 +140,7 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
         return shown, self.rows.reward.item(), self._is_over, False, info
 
     def render(self) -> Frame | None:
-        """The present state as a picture, uint8 [192, 384, 3], or as text."""
+        """The state as a picture, uint8 [192, 384, 3], or text."""
         frames = _frames(self)
         return frames[0] if frames else None
 
@@ -155,15 +152,13 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
 
     Args:
         num_envs: number of rows.
-        task: see `make_task`, as for ``config`` and ``changes``; or a list of one task per row.
-        config: see `make_task`.
-        task_pool: the tasks that `set_tasks` may be given. Default: the rows' tasks.
-        task_ids: see `CTGraphGymEnv`, as for ``num_task_ids``; ids are uint8 [num_envs, num_task_ids].
+        task: as in `make_task`, also ``config`` and ``changes``; or a list of a task per row.
+        task_pool: tasks that `set_tasks` takes. Default: the rows' tasks.
+        task_ids: as in `CTGraphGymEnv`, also ``num_task_ids``; ids are uint8 [num_envs, num_task_ids].
         render_mode: ``rgb_array``, ``ansi`` or None.
         autoreset_mode: when a row starts its next episode: ``NextStep``, in the next step, which ignores its action;
             ``SameStep``, at once, the last in ``final_obs`` and ``final_info``; ``Disabled``, by `reset` of a mask.
-        kernel: ``"auto"``, ``"off"`` or ``"required"``, whether the C kernel takes the steps: see `Rows`.
-        changes: see `make_task`.
+        kernel: ``"auto"``, ``"off"`` or ``"required"``, as in `Rows`.
 
     Raises:
         ValueError: for values out of range.
@@ -214,7 +209,7 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         self._is_over = np.ones(num_envs, np.bool_)
 
     def set_tasks(self, tasks: Iterable[Task]) -> None:
-        """Give every row a task of the pool; a row changes to it at its next reset."""
+        """Give every row a task of the pool, from its next reset."""
         numbers = np.array(find_numbers(self.task_pool, tasks))
         require((len(numbers) == self.num_envs, f"set_tasks needs {self.num_envs} tasks, got {len(numbers)}"))
         self._next_numbers = numbers
@@ -228,10 +223,10 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
 
         Args:
             seed: start the random streams of (seed + i, row 0), or of a list's seeds; None: continue the present ones.
-            options: ``{"reset_mask": bool [N]}`` says which rows; the others stay unchanged.
+            options: ``{"reset_mask": bool [N]}``: the rows to reset.
 
         Raises:
-            ValueError: for wrong seeds and masks, and a mask in the very first reset.
+            ValueError: for wrong seeds and masks, and a mask in the first reset.
         """
         mask = np.ones(self.num_envs, np.bool_)
         if options is not None and "reset_mask" in options:
@@ -272,7 +267,7 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         return observation, rewards, done.copy(), np.zeros_like(done), infos
 
     def _restart(self, done: RowMask, final: Shown) -> tuple[Shown, NamedValues]:
-        """Start an episode in rows that are done; what is shown then, and the infos with what was shown last."""
+        """Start an episode in done rows; return what is shown then, and infos with what was shown last."""
         last = np.full(self.num_envs, None, dtype=object)
         for i, observation in zip(done.nonzero()[0], final.observation.numpy()[done], strict=True):
             last[i] = add_id(observation, self._ids, self._numbers[i])
@@ -283,7 +278,7 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         return shown, infos | self._infos(shown)
 
     def _infos(self, shown: Shown, mask: RowMask | None = None) -> NamedValues:
-        """Return what `CTGraphGymEnv` gives in ``info``, for the rows of a mask or for all, as Gymnasium batches it."""
+        """Return `CTGraphGymEnv`'s ``info`` for a mask's rows, or all, as Gymnasium batches it."""
         values = {"task": self._numbers, "outcome": shown.outcome.numpy(), "leaf": shown.leaf.numpy()}
         infos: NamedValues = {}
         for key, value in values.items():
@@ -305,7 +300,7 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         return torch.from_numpy(action.astype(np.int64))
 
     def _start_streams(self, mask: RowMask, seed: int | Sequence[int | None] | None) -> None:
-        """Start random streams in the rows of a mask that are given a seed, and in all at first."""
+        """Start random streams in a mask's rows that get a seed, and in all at first."""
         seeds: Any = (None,) * self.num_envs if seed is None else as_tuple(seed)
         if isinstance(seed, int) and is_int(seed, 0):
             super().reset(seed=seed)
@@ -335,26 +330,25 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
             self._next_numbers = self._numbers
 
     def _only(self, mask: RowMask, change: Callable[[], None]) -> None:
-        """A change that ends all episodes, in the rows of a mask only."""
+        """Restrict a change that ends episodes to a mask's rows."""
         before = self.rows.state
         change()
         self.rows.state = choose(torch.from_numpy(mask), self.rows.state, before)
 
     def render(self) -> tuple[Frame, ...] | None:
-        """The present state of every row as a picture, uint8 [192, 384, 3], or as text."""
+        """Every row's state as a picture, uint8 [192, 384, 3], or text."""
         return _frames(self)
 
 
 def add_task_ids(
     space: spaces.Space[Any], pool: Sequence[Task], task_ids: Mapping[Task, int] | None, num_task_ids: int | None
 ) -> tuple[spaces.Space[Any], NDArray[np.uint8] | None]:
-    """Return the space of observations with ids of tasks, and the id of each task of a pool as one-hot.
+    """Return the space of observations with task ids, and the pool's ids as one-hot.
 
     Args:
         space: of observations without ids.
-        pool: the tasks.
-        task_ids: their ids; None: the space stays unchanged, and there are none.
-        num_task_ids: length of an id; None: just enough.
+        task_ids: None: the space stays unchanged, without ids.
+        num_task_ids: None: just enough.
 
     Raises:
         ValueError: for a task without an id, and ids that do not fit the length.
@@ -369,7 +363,7 @@ def add_task_ids(
 
 
 def add_id(observation: NDArray[np.uint8], ids: NDArray[np.uint8] | None, task: Any) -> Any:
-    """Return an observation, or those of a batch, with the ids of the numbered tasks, if there are ids."""
+    """Return one observation, or a batch's, with the numbered tasks' ids, if any."""
     return observation if ids is None else {"observation": observation, "task_id": ids[task].copy()}
 
 

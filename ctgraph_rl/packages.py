@@ -1,4 +1,4 @@
-"""Where `curricula`, `baselines` and the yaml files in ``conf`` are, and how what a name stands for is imported."""
+"""Places of `curricula`, `baselines` and ``conf``, and imports by name."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from ctgraph_rl.checks import require
 HERE = Path(__file__).resolve().parent
 
 OF_REPORT = ("matplotlib", "jinja2", "scipy")
-"""Packages that the extra ``report`` installs."""
+"""Packages of the extra ``report``."""
 
 
 def makes_page(command: str) -> str:
-    """Return the command that makes a page, and what to install for it where that is missing."""
+    """Return the command for a page, and what to install for it."""
     first = "" if all(map(find_spec, OF_REPORT)) else "; first pip install 'ctgraph_rl[report]'"
     return f"ctgraph-rl {command} makes a page of figures and tables{first}"
 
 
 def conf_dir() -> str:
-    """Return the folder with the configuration: in the package when installed from a wheel, beside it in a checkout."""
+    """Return the configuration's folder: in the package if installed from a wheel, else beside it."""
     for candidate in (HERE / "conf", HERE.parent / "conf"):
         if (candidate / "config.yaml").is_file():
             return str(candidate)
@@ -39,13 +39,13 @@ def check_packages() -> None:
     """Refuse a ``curricula`` or ``baselines`` that is not the one installed with this package.
 
     Raises:
-        ValueError: if a folder or a file, usually in the working directory, shadows one of them; names it.
+        ValueError: names a folder or file, usually in the working directory, that shadows one.
     """
     require(*((False, message) for message in _shadows("curricula", "baselines")))
 
 
 def warn_of_shadows() -> None:
-    """Warn the importer of this package of what `check_packages` refuses."""
+    """Warn of what `check_packages` refuses."""
     for message in _shadows("curricula", "baselines"):
         warnings.warn(message, stacklevel=3)
 
@@ -62,7 +62,7 @@ def _shadows(*names: str) -> Iterator[str]:
 
 
 def import_agents(config_dir: Path) -> list[str]:
-    """Import the modules of a user's agents, so that their runs can be loaded; return why some were not."""
+    """Import the modules of a user's agents, so that runs can be loaded; return why some failed."""
     import yaml
 
     problems = []
@@ -77,14 +77,14 @@ def import_agents(config_dir: Path) -> list[str]:
 
 
 def load_object(name: str) -> Any:
-    """Return what a name such as ``module:Class`` stands for, in a module of anyone."""
+    """Return the object of a name such as ``module:Class``."""
     module, _, own_name = name.partition(":")
     return attrgetter(own_name)(import_module(module))
 
 
 @contextmanager
 def importing_from_here() -> Iterator[None]:
-    """Find modules in the working directory, too, as a run does."""
+    """Find modules in the working directory, too."""
     before = list(sys.path)
     sys.path.append(os.getcwd())
     try:
@@ -94,10 +94,10 @@ def importing_from_here() -> Iterator[None]:
 
 
 def class_named(module: str, name: str) -> type | None:
-    """Return a class that a module of `baselines` defines; None if there is no such module or class.
+    """Return a class of a module of `baselines`, or None.
 
     Raises:
-        ValueError: see `check_packages`.
+        ValueError: as `check_packages`.
     """
     check_packages()
     if find_spec(module) is None:

@@ -1,8 +1,7 @@
 """Reference policies that know the hidden state: what can be reached, and what random actions reach.
 
-Each is built on the environment that it acts in, takes the data of its rows and writes ``action``:
-``env.rollout(100, OptimalPolicy(env))``, and ``evaluate(OptimalPolicy, tasks)``, which builds it on an environment of
-its own. Draws come from torch's global generator.
+Each is built on the environment that it acts in and writes ``action``: ``env.rollout(100, OptimalPolicy(env))``, or
+``evaluate(OptimalPolicy, tasks)``. Draws come from torch's global generator.
 """
 
 from __future__ import annotations
@@ -18,11 +17,7 @@ from ctgraph_rl.env import CTGraphEnv
 
 
 class RandomPolicy:
-    """Every action of a row's graph is equally likely; it reaches the goal with probability P_R.
-
-    Args:
-        env: where it acts.
-    """
+    """Every action of a row's graph is equally likely; it reaches the goal with probability P_R."""
 
     def __init__(self, env: CTGraphEnv) -> None:
         self.env = env
@@ -48,7 +43,7 @@ class NavigationPolicy(RandomPolicy):
         return torch.where(decides, self.decision(tensordict), WAIT_ACTION)
 
     def decision(self, tensordict: TensorDictBase) -> Tensor:
-        """Return the decision of each row, in 1..b, for rows at a decision state."""
+        """Return decisions, in 1..b, for rows at a decision state."""
         return 1 + self._random_below(self.env.branching_factor)
 
 
@@ -67,7 +62,7 @@ class OptimalPolicy(NavigationPolicy):
         return self._towards(self.env.goal_leaf)
 
     def _towards(self, leaf: Tensor) -> Tensor:
-        """The decision on the way from each row's node to an end state; 1 where the node is not on the way."""
+        """The decision from each row's node to an end state; 1 off the way."""
         b = self.env.branching_factor
         node = self.env.node
         child = self.env.first_leaf + leaf
@@ -83,10 +78,10 @@ class OptimalPolicy(NavigationPolicy):
 class SearchPolicy(OptimalPolicy):
     """Tries end states without replacement until it finds the goal, then stays with it until an episode misses it.
 
-    It knows the graph, and of the goal only whether its last episode reached it. Each row goes through the end states
-    in order from a random one on, so the episode that finds the goal is uniform on 1..b^d with mean
-    E[kappa] = (b^d + 1) / 2. After a new draw of the goal, episode i with it succeeds with probability
-    min(1, i / b^d). An episode that is cut before the last wait state is tried again.
+    It knows the graph, and only whether its last episode reached the goal. Each row tries the end states in order from
+    a random one on, so the first success is uniform on 1..b^d with mean E[kappa] = (b^d + 1) / 2. Episode i after a new
+    draw of the goal succeeds with probability min(1, i / b^d). An episode cut before the last wait state is tried
+    again.
     """
 
     def __init__(self, env: CTGraphEnv) -> None:

@@ -1,7 +1,7 @@
 """Portable runs: the same bits on every x86-64 CPU with AVX2, by variables that PyTorch reads when it is imported.
 
-PyTorch, MKL and oneDNN choose their code by the CPU. Code for other instruction sets adds in another order and rounds
-differently, and a run amplifies that. Held to the code that all these CPUs have, a run depends on none of them.
+PyTorch, MKL and oneDNN choose their code, and so their rounding, by the CPU, and a run amplifies that. Held to the
+code that all these CPUs have, a run depends on none of them.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ VARIABLES = {
     "MKL_CBWR": "COMPATIBLE",  # products of matrices: MKL's only code with the same bits on Intel's and AMD's CPUs
     "ONEDNN_MAX_CPU_ISA": "AVX2",  # convolutions
 }
-"""Environment variables that a portable process has when it imports torch."""
+"""Environment variables of a portable process."""
 
 NEEDED = ("avx2", "fma")
-"""Instructions that a portable run needs; libm takes those of FMA, too."""
+"""Instructions of portable runs; libm takes those of FMA, too."""
 
 
 class Restart(BaseException):
-    """The command must start again; no error, so that nothing between it and the entry point handles it."""
+    """The command must start again; not an error, so that only the entry point handles it."""
 
 
 _HELD: list[Any] = []
-"""What `hold` registered with PyTorch, which ends with these objects."""
+"""What `hold` registered with PyTorch, for the same lifetime."""
 
 
 def is_portable() -> bool:
@@ -41,13 +41,13 @@ def is_portable() -> bool:
 
 
 def hold() -> None:
-    """Hold PyTorch to portable code, for as long as this process lasts, beyond what `VARIABLES` do.
+    """Hold PyTorch to portable code in this process, beyond `VARIABLES`.
 
-    oneDNN's LSTM has other bits on Intel's and AMD's CPUs, so PyTorch's own is taken. MKL's square root starts from the
-    approximation of the CPU and is not rounded correctly; NumPy's is.
+    oneDNN's LSTM differs between Intel and AMD, so PyTorch's is taken. MKL's square root starts from the CPU's
+    approximation and is not rounded correctly; NumPy's is.
 
     Raises:
-        ValueError: see `check_portable`.
+        ValueError: as `check_portable`.
     """
     check_portable()
     if _HELD:
@@ -74,7 +74,7 @@ def check_portable() -> None:
     """Refuse a portable run in a process that is not portable.
 
     Raises:
-        ValueError: for a CPU that lacks instructions, and for variables that are not set; names them.
+        ValueError: names missing instructions or variables.
     """
     lacking = _find_lacking()
     variables = " ".join(f"{name}={value}" for name, value in VARIABLES.items())
@@ -83,7 +83,7 @@ def check_portable() -> None:
 
 
 def become_portable() -> None:
-    """Ask for a restart of the command with `VARIABLES`, unless this process is portable.
+    """Restart the command with `VARIABLES`, unless this process is portable.
 
     Raises:
         Restart: which the command's entry point answers with `restart`.
@@ -95,11 +95,11 @@ def become_portable() -> None:
 
 
 def restart(environment: Mapping[str, str], arguments: Sequence[str]) -> NoReturn:
-    """Start the command of this process again, in the same process, with `VARIABLES` in its environment.
+    """Start the command again, in the same process, with `VARIABLES` in its environment.
 
     Args:
-        environment: of the command, as it was given.
-        arguments: of the command, as they were given.
+        environment: of the command.
+        arguments: of the command.
 
     Raises:
         ValueError: in a process that was started for something else, such as a notebook's.
@@ -112,7 +112,7 @@ def restart(environment: Mapping[str, str], arguments: Sequence[str]) -> NoRetur
 
 
 def cpu_model() -> str | None:
-    """Return the name of the CPU's model; None where the system does not say it."""
+    """Return the CPU's model, if known."""
     return _read_cpu("model name") or platform.processor() or None
 
 

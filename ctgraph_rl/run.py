@@ -1,4 +1,4 @@
-"""The main job: a configuration becomes a curriculum and an agent, which learns it; results are files.
+"""The main job: an agent learns a configured curriculum; results are files.
 
 ``python -m ctgraph_rl.run curriculum=su_b1_4tasks agent=lstm_ppo seed=0``
 """
@@ -43,18 +43,14 @@ from ctgraph_rl.runs.sweep import Sweeper, sweepable
 
 
 def run(cfg: DictConfig, run_dir: Path) -> float | None:
-    """Learn the configured curriculum with the configured agent and write the results to a directory.
-
-    Args:
-        cfg: the composed configuration.
-        run_dir: an existing directory.
+    """Learn the configured curriculum with the configured agent; write the results to an existing directory.
 
     Returns:
-        The metric that ``objective`` names, the mean of several learners or seeds; None if it names none.
+        The metric of ``objective``, averaged over learners or seeds, or None.
 
     Raises:
         ValueError: before any work, for a value out of range; after it, if the objective has no value.
-        FileExistsError: if the directory holds results that ``overwrite`` does not allow to replace.
+        FileExistsError: for results that ``overwrite`` does not replace.
     """
     check_packages()
     with first_imports():
@@ -64,7 +60,7 @@ def run(cfg: DictConfig, run_dir: Path) -> float | None:
 
 
 def show_sweep(run_dirs: Sequence[Path]) -> None:
-    """Print the table of a sweep that is done, if it is short and scipy is there, and the command that shows more."""
+    """Print a finished sweep's table, if short and with scipy, and the command for more."""
     here = Path(os.path.relpath(os.path.commonpath(run_dirs)))
     folder = terminal_text(shlex.quote(str(here)))
     if not (run_dirs[0] / LOG).exists():
@@ -81,11 +77,11 @@ def show_sweep(run_dirs: Sequence[Path]) -> None:
 
 
 class CellError(RuntimeError):
-    """What stopped a cell of a sweep, in words: not every exception can travel between processes."""
+    """What stopped a cell of a sweep, in words that can travel between processes."""
 
 
 ERRORS = (HydraException, OmegaConfBaseException, ValueError, ImportError, OSError, FloatingPointError, CellError)
-"""Errors that a user can cause, each answered with one message."""
+"""Users' errors, each answered with one message."""
 
 HELP = """ctgraph-rl run SETTING=VALUE ...: an agent learns a curriculum, and its transfer and forgetting are measured.
 
@@ -103,7 +99,7 @@ MOST_IN_TABLE = 50
 """Cells of a sweep whose results are read at its end."""
 
 SEARCHERS = ("ax", "nevergrad", "optuna")
-"""Sweepers of Hydra that search for what makes the value of a run best."""
+"""Hydra's sweepers that search for the best value of a run."""
 
 
 class Stop(BaseException):
@@ -111,7 +107,7 @@ class Stop(BaseException):
 
     Args:
         error: what stopped the run.
-        message: about it, for the user.
+        message: for the user.
     """
 
     def __init__(self, error: Exception, message: str) -> None:
@@ -123,8 +119,7 @@ class Stop(BaseException):
 class HydraJob:
     """What Hydra calls with a configuration.
 
-    The processes of a launcher get it by pickle, and with it the name that a run's directory has: an import registers
-    nothing with Hydra.
+    Launchers' processes get it by pickle, with the run name's resolver, which an import does not register.
     """
 
     def __init__(self) -> None:
@@ -134,7 +129,7 @@ class HydraJob:
         return HydraJob, ()
 
     def __call__(self, cfg: DictConfig) -> float | None:
-        """Run one cell, and return its value for a sweeper that searches."""
+        """Run one cell; return its value for a sweeper that searches."""
         run_dir = Path(HydraConfig.get().runtime.output_dir)
         if HydraConfig.get().job.chdir:
             os.chdir(HydraConfig.get().runtime.cwd)  # relative paths are of the directory that the command was given in
@@ -158,7 +153,7 @@ class HydraJob:
 
 
 def remove_empty(run_dir: Path) -> None:
-    """Remove a run directory without a file, and folders above it within the working directory that then are empty."""
+    """Remove a run directory without files, and then empty folders above it in the working directory."""
     here = Path.cwd()
     with suppress(OSError):
         for folder in (run_dir, *run_dir.parents):
@@ -167,7 +162,7 @@ def remove_empty(run_dir: Path) -> None:
 
 
 def main() -> None:
-    """Entry point: a user's error is one message and an exit code; HYDRA_FULL_ERROR=1 shows where it came from."""
+    """Entry point: a user's error is one message and an exit code; HYDRA_FULL_ERROR=1 shows its origin."""
     environment = dict(os.environ)
     arguments = sys.argv[1:]
     full_error = os.environ.setdefault("HYDRA_FULL_ERROR", "0") not in ("", "0")
@@ -203,11 +198,7 @@ def main() -> None:
 
 
 def settings_help(given: Namespace) -> str:
-    """Return the choices and the settings of a run; Hydra's own help takes as long as the import of torch.
-
-    Args:
-        given: a command line as Hydra parses it.
-    """
+    """Return a run's choices and settings, faster than Hydra's help; ``given`` is a parsed command line."""
     own = None if given.config_dir is None else Path(given.config_dir)
     folders = [folder for folder in (Path(conf_dir()), own) if folder is not None]
     groups = sorted({path.parent.name for folder in folders for path in folder.glob("*/*.yaml")})
@@ -217,7 +208,7 @@ def settings_help(given: Namespace) -> str:
 
 
 def options_first(arguments: Sequence[str]) -> list[str]:
-    """Return a command line with its options first: Hydra 1.3 refuses those that follow settings.
+    """Return a command line with its options first, as Hydra 1.3 wants.
 
     Raises:
         SystemExit: with code 2, for an option that Hydra does not know.

@@ -1,4 +1,4 @@
-"""What a configuration runs: a single run, seeds as one batch, or a collective; then its results are shown."""
+"""What a configuration runs: a single run, seeds as one batch, or a collective; then its results show."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ctgraph_rl.runs.job import run_job, run_seeds
 
 
 def run_configuration(cfg: Any, run_dir: Path) -> float | None:
-    """Run a configuration in an existing directory, and show its results; see `ctgraph_rl.run.run`."""
+    """Run a configuration in an existing directory, and show its results; as `ctgraph_rl.run.run`."""
     if cfg.objective is not None:
         check_objective(cfg.objective, cfg.experts)
     if cfg.report:
@@ -41,7 +41,7 @@ def run_configuration(cfg: Any, run_dir: Path) -> float | None:
 
 
 def show(run_dir: Path, report: bool) -> None:
-    """Print the results of a finished run, and make its report or say how."""
+    """Print a finished run's results, and make its report or say how."""
     print_summary(run_dir)
     here = Path.cwd()
     shown = run_dir.relative_to(here) if run_dir.is_relative_to(here) else run_dir

@@ -1,4 +1,4 @@
-"""CT-graphs for Stable-Baselines3 in one batch, many times as fast as its ``make_vec_env`` with Gymnasium's ids."""
+"""CT-graphs for Stable-Baselines3 in one batch, many times as fast as its ``make_vec_env``."""
 
 from __future__ import annotations
 
@@ -28,11 +28,10 @@ class SB3VecEnv(VecEnv):
 
     Args:
         num_envs: number of rows.
-        task: see `CTGraphVectorEnv`, as for all others but the autoreset mode.
+        task: as in `CTGraphVectorEnv`, also all others but the autoreset mode.
         task_ids: the id of each task of the pool, such as ``curriculum.task_ids``. Observations are then a dict of
             ``observation`` and ``task_id``, uint8 [num_envs, num_task_ids]: the row's id as one-hot.
         num_task_ids: length of ``task_id``; None: just enough.
-        kwargs: see `CTGraphVectorEnv`.
 
     Example:
         >>> envs = SB3VecEnv(256, "CT-SU-B1")
@@ -59,7 +58,7 @@ class SB3VecEnv(VecEnv):
         return add_id(observation, self._ids, tasks)
 
     def reset(self) -> Any:
-        """Start an episode in all rows, with the seeds that ``seed`` was given before."""
+        """Start an episode in all rows, with the seeds of ``seed``."""
         observation, infos = self.envs.reset(seed=self._seeds)
         self._reset_seeds()
         self._reset_options()
@@ -71,7 +70,7 @@ class SB3VecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """One step; rows that are done start an episode at once and say in ``terminal_observation`` what was last."""
+        """One step; done rows start an episode and have the last observation in ``terminal_observation``."""
         observation, rewards, done, _, batch = self.envs.step(self._actions)
         infos = _by_row(batch, **{"TimeLimit.truncated": False})
         ended = done.nonzero()[0].tolist()
@@ -94,7 +93,7 @@ class SB3VecEnv(VecEnv):
         return cast("Sequence[NDArray[np.uint8] | None]", frames or [None] * self.num_envs)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute of the batch, once for every row; a space is that of one row."""
+        """An attribute of the batch, repeated for every row; spaces are of one row."""
         name = {"action_space": "single_action_space"}
         owner = self if attr_name == "observation_space" else self.envs
         found = getattr(owner, attr_name if owner is self else name.get(attr_name, attr_name))

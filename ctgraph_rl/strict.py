@@ -1,7 +1,7 @@
-"""Readers of files of other people: one for each format, which takes what has one meaning and refuses the rest.
+"""Strict readers of other people's files, one per format.
 
-They refuse what two programs could read as two things, such as a key that is there twice, and what would take more
-memory or time than its file says. Every error is a ``ValueError`` of one line.
+They refuse what two programs could read differently, such as a repeated key, and what would take more memory or time
+than its file says. Every error is a ``ValueError`` of one line.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ LONGEST_NUMBER = 40
 LONG_NUMBER = re.compile("[0-9]" * (LONGEST_NUMBER + 1))
 
 MAX_DEPTH = 32
-"""Folders within each other in which files are looked for."""
+"""Nesting of folders that are searched."""
 
 
 @contextmanager
 def named(path: Path) -> Iterator[None]:
-    """Name a file in errors about what it holds."""
+    """Name a file in errors about its content."""
     try:
         yield
     except ValueError as error:
@@ -45,7 +45,7 @@ def named(path: Path) -> Iterator[None]:
 
 @contextmanager
 def within(place: object) -> Iterator[None]:
-    """Begin errors with the file or the key that they are about, unless they do."""
+    """Begin errors with their file or key."""
     try:
         yield
     except ValueError as error:
@@ -58,11 +58,11 @@ def json_value(content: bytes, finite: bool = True, nesting: int = MAX_NESTING) 
 
     Args:
         content: the text.
-        finite: whether NaN and infinity are refused, which Python writes and JSON does not have.
+        finite: refuse NaN and infinity, which are not JSON.
         nesting: most objects and lists within each other.
 
     Raises:
-        ValueError: for what is no JSON, a key twice in an object, an integer of too many digits, and too deep nesting.
+        ValueError: for anything but JSON, repeated keys, too long integers, and too deep nesting.
     """
     text = content.decode("utf-8")
     try:
@@ -82,7 +82,7 @@ def json_value(content: bytes, finite: bool = True, nesting: int = MAX_NESTING) 
 def json_object(
     path_or_dict: str | os.PathLike[str] | ReadOnlyValues, name: str, most: int, nesting: int = MAX_NESTING
 ) -> tuple[str, ReadOnlyValues]:
-    """Return the name of a source for errors, and the object of JSON that it holds.
+    """Return a source's name, for errors, and its JSON object.
 
     Args:
         path_or_dict: a file, or its content.
@@ -91,7 +91,7 @@ def json_object(
         nesting: most objects and lists within each other.
 
     Raises:
-        ValueError: for a file that cannot be read, or holds something else.
+        ValueError: for an unreadable file, or another value.
     """
     if isinstance(path_or_dict, Mapping):
         return name, path_or_dict
@@ -133,12 +133,12 @@ def _no_number(name: str) -> float:
 
 
 class _Plain(yaml.SafeLoader):
-    """Reads plain values: no aliases, no numbers of other bases, no dates, no key twice."""
+    """Reads plain values: no aliases, other bases, dates or repeated keys."""
 
     depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """Refuse what stands for something else, and too deep values, before they are made."""
+        """Refuse aliases and too deep values before they are made."""
         event = self.peek_event()
         require(
             (not isinstance(event, yaml.AliasEvent), "aliases (*name) are not read: write the value in its place"),
@@ -184,7 +184,7 @@ def yaml_value(content: bytes) -> Any:
     """Return the value of a YAML text in UTF-8.
 
     Raises:
-        ValueError: for what is no YAML of plain values, aliases, and a key that is there twice.
+        ValueError: for anything but YAML of plain values, aliases, and repeated keys.
     """
     try:
         return yaml.load(content.decode("utf-8"), Loader=_Plain)
@@ -193,9 +193,9 @@ def yaml_value(content: bytes) -> Any:
 
 
 def files_below(folder: Path, names: Sequence[str] = ()) -> tuple[list[Path], list[Path]]:
-    """Return the files in or below a folder, sorted, and the folders that are too deep to look into.
+    """Return the sorted files in or below a folder, and the folders that are too deep.
 
-    Links to folders count as files. ``names`` are those of the files to find; empty for all.
+    Links to folders count as files. ``names``, if any, are those to find.
     """
     files = []
     deep = []
@@ -217,22 +217,22 @@ def files_below(folder: Path, names: Sequence[str] = ()) -> tuple[list[Path], li
 
 
 def one_line_of(error: Exception, file: Path) -> str:
-    """Return why a file cannot be read, with the kind of an error that no rule foresees."""
+    """Return why a file cannot be read, with the kind of an unforeseen error."""
     foreseen = isinstance(error, (OSError, ValueError)) and not isinstance(error, UnicodeError)
     said = " ".join(str(error).split())
     return said if foreseen else f"{file} cannot be read ({type(error).__name__}: {said:.200})"
 
 
 def too_deep(folder: Path) -> str:
-    """Return why nothing is looked for in a folder."""
+    """Return why a folder is not searched."""
     return f"{folder} is more than {MAX_DEPTH} folders deep, and is not looked into: name it, or one above it"
 
 
 def sha256_of(path: Path, most: int) -> str:
-    """Return the SHA-256 of a regular file, which is not read into memory as a whole.
+    """Return the SHA-256 of a regular file, without reading it whole into memory.
 
     Raises:
-        ValueError: for what is no regular file, and one of more than ``most`` bytes.
+        ValueError: for other than regular files, and more than ``most`` bytes.
     """
     found = path.lstat()
     require((stat.S_ISREG(found.st_mode), f"{path} must be a regular file"))

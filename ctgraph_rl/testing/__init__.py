@@ -1,6 +1,6 @@
 """Test classes for tasks, environments, agents and methods of your own: inherit one, and pytest runs its tests.
 
-It imports `ctgraph_rl.learn` and `ctgraph_rl.runs`, and no pytest; our own tests inherit the same classes.
+It imports no pytest; our own tests inherit the same classes.
 """
 
 from ctgraph_rl.testing.environments import EnvironmentContract as EnvironmentContract

@@ -1,4 +1,4 @@
-"""What holds for every kind of tasks, and for the environment that it makes; see `TaskLike`."""
+"""Tests of every kind of tasks, by `TaskLike`, and of its environment."""
 
 from __future__ import annotations
 
@@ -18,16 +18,14 @@ from ctgraph_rl.tasks.protocol import Block, Protocol
 from ctgraph_rl.tasks.switch import ByEpisode
 
 NUM_STEPS = 40
-"""Steps of a test, in which at least one row should end an episode."""
+"""Of a test, in which at least one row should end an episode."""
 
 TOO_LONG = f"no episode ended in {NUM_STEPS} steps: give tasks with a shorter time limit"
 
 
 class _OfTasks:
-    """Has tasks to test."""
-
     def make_tasks(self) -> Sequence[Any]:
-        """Return two different tasks of one kind, equal ones at every call; override it."""
+        """Return two different tasks of one kind, equal at every call."""
         raise NotImplementedError
 
     def curriculum(self, **protocol: Any) -> Curriculum:
@@ -46,7 +44,7 @@ class TaskContract(_OfTasks):
     """
 
     def test_tasks_are_equal_and_hashed_by_value(self) -> None:
-        """Two calls of `make_tasks` give the same tasks, and a call gives different ones."""
+        """Two calls of `make_tasks` give the same, different tasks."""
         once = list(self.make_tasks())
         again = list(self.make_tasks())
 
@@ -55,7 +53,7 @@ class TaskContract(_OfTasks):
         assert once[0] != once[1]
 
     def test_a_curriculum_of_them_has_labels_and_survives_json(self) -> None:
-        """Each task has a label, and the fingerprint is that of the tasks' values."""
+        """The fingerprint is of the tasks' values."""
         curriculum = self.curriculum()
 
         assert all(curriculum.labels)
@@ -63,7 +61,7 @@ class TaskContract(_OfTasks):
         assert replace(curriculum, blocks=curriculum.blocks[:1]).fingerprint != curriculum.fingerprint
 
     def test_what_is_known_of_returns_is_in_order_or_says_why_it_is_not_known(self) -> None:
-        """``return_bounds`` and ``optimal_value``, where tasks have them."""
+        """Of ``return_bounds`` and ``optimal_value``."""
         for task in self.make_tasks():
             if hasattr(type(task), "return_bounds") and hasattr(type(task), "optimal_value"):
                 try:
@@ -74,17 +72,17 @@ class TaskContract(_OfTasks):
 
 
 class EnvironmentContract(_OfTasks):
-    """Tests of the environment that a kind of tasks makes. Override `make_tasks`."""
+    """Tests of a kind's environment. Override `make_tasks`."""
 
     shows_task_ids = True
-    """Whether it can show task ids; set it to False if not: a change of the task is then not tested."""
+    """False leaves out tests of changing tasks."""
 
     def make_env(self, rows: Sequence[TaskLike], seed: int = 0, **protocol: Any) -> Any:
         """Return an environment with these rows."""
         return make_env(self.curriculum(**protocol), rows, seed)
 
     def steps(self, env: Any, actions: Sequence[Any] = ()) -> Iterator[tuple[TensorDictBase, TensorDictBase]]:
-        """Yield steps from a reset on, each with the data of the next one; actions are random unless given."""
+        """Yield steps from a reset on, each with the next data; actions are random unless given."""
         data = env.reset()
         for number in range(len(actions) or NUM_STEPS):
             data = data.set("action", actions[number]) if actions else env.rand_action(data)
@@ -92,7 +90,7 @@ class EnvironmentContract(_OfTasks):
             yield step, data.clone()
 
     def test_data_are_as_the_specs_say(self) -> None:
-        """TorchRL's own check, and the shapes and actions that tasks state."""
+        """By TorchRL's check, and the tasks' shapes and actions."""
         first, other = self.make_tasks()
         env = self.make_env([first, other, first])
 
@@ -102,7 +100,7 @@ class EnvironmentContract(_OfTasks):
         assert getattr(env.action_spec_unbatched, "n", None) == first.num_actions
 
     def test_counts_and_sums_are_of_an_episode(self) -> None:
-        """They start again where an episode begins, and ``next`` shows those of its end."""
+        """They start again with an episode; ``next`` shows those of its end."""
         first, _ = self.make_tasks()
         env = self.make_env([first] * 4)
         count = torch.zeros(4, 1, dtype=torch.int64, device="cpu")
@@ -134,7 +132,7 @@ class EnvironmentContract(_OfTasks):
             _assert_equal(step, other, following, other_following)
 
     def test_a_row_changes_its_task_where_its_episode_ends(self) -> None:
-        """``set_tasks(tasks, at_episode_end=True)``, by the ids that rows show."""
+        """``set_tasks(tasks, at_episode_end=True)``, by shown ids."""
         if not self.shows_task_ids:
             return
         first, other = self.make_tasks()
@@ -147,7 +145,7 @@ class EnvironmentContract(_OfTasks):
         self._follow_ids(env, data, lambda episodes: episodes > 0)
 
     def test_a_switch_changes_the_task_of_each_episode(self) -> None:
-        """``switch_tasks(tasks, switch)``, where an environment that shows ids has it."""
+        """``switch_tasks(tasks, switch)``, where an environment with ids has it."""
         tasks = list(self.make_tasks())
         if not self.shows_task_ids:
             return
@@ -158,7 +156,7 @@ class EnvironmentContract(_OfTasks):
             self._follow_ids(env, env.reset(), lambda episodes: episodes % 2 == 1)
 
     def _follow_ids(self, env: Any, data: TensorDictBase, is_second: Callable[[Tensor], Tensor]) -> None:
-        """Assert that rows show the second task where it is due after so many episodes, [N, 1], and else the first."""
+        """Assert that rows show the second task where due after so many episodes, [N, 1], else the first."""
         episodes = torch.zeros(3, 1, dtype=torch.int64, device="cpu")
         for _ in range(NUM_STEPS):
             step, data = env.step_and_maybe_reset(env.rand_action(data))
@@ -168,7 +166,7 @@ class EnvironmentContract(_OfTasks):
         assert episodes.any(), TOO_LONG
 
     def test_a_saved_environment_resumes_with_the_same_bits(self) -> None:
-        """Where tasks say that they resume."""
+        """Where tasks have ``resumes``."""
         tasks = list(self.make_tasks())
         if not getattr(tasks[0], "resumes", False):
             return
@@ -188,6 +186,6 @@ class EnvironmentContract(_OfTasks):
 def _assert_equal(
     step: TensorDictBase, other: TensorDictBase, following: TensorDictBase, other_following: TensorDictBase
 ) -> None:
-    """Two steps, and what follows each, show the same."""
+    """Assert that two steps and their next data are equal."""
     assert all(step["next", key].equal(other["next", key]) for key in (*SHOWN, "reward", "done"))
     assert all(following[key].equal(other_following[key]) for key in SHOWN)

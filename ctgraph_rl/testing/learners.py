@@ -1,4 +1,4 @@
-"""What holds for every agent and for every lifelong-learning method; see `ctgraph_rl.agent`."""
+"""Tests of every agent and lifelong-learning method, by `ctgraph_rl.agent`."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ class AgentContract:
     """
 
     def make_agent(self, observation_spec: Any, action_spec: Any) -> Agent:
-        """Return a new agent for unbatched specs; override it."""
+        """Return a new agent for unbatched specs."""
         raise NotImplementedError
 
     def protocol(self) -> Protocol:
-        """Return what the agent is given on tasks and boundaries."""
+        """Return the protocol of the agent's runs."""
         return Protocol()
 
     def curriculum(self) -> Curriculum:
-        """Return two blocks of three batches: a small task each, or both tasks for an agent that adapts to drawn ones.
+        """Return two blocks of three batches: a small task each, or both for an agent that adapts.
 
-        Failing costs, so that every batch has rewards to learn from.
+        Failing costs, so that every batch has rewards.
         """
         first = replace(ct_graph(depth=1, fully_observable=False), fail_reward=-1.0)
         tasks = (first, replace(first, goal=(2,)))
@@ -58,12 +58,12 @@ class AgentContract:
         return new_agent(curriculum, self.make_agent, seed)
 
     def learnt(self, curriculum: Curriculum, built_with: int = 0, **how: Any) -> tuple[Agent, RunLog]:
-        """Return an agent that was built with a seed and learned a curriculum, and its log."""
+        """Return an agent that learned a curriculum, and its log."""
         agent = self.build(curriculum, built_with)
         return agent, learn_curriculum(curriculum, agent, **how)
 
     def test_a_policy_writes_an_action_for_each_row(self) -> None:
-        """Of the type and in the range of the specs."""
+        """Of the specs' type and range."""
         curriculum = self.curriculum()
         agent = self.build(curriculum)
         env = make_env(curriculum, curriculum.tasks[:1] * 3, 0)
@@ -75,7 +75,7 @@ class AgentContract:
         assert env.action_spec.is_in(written["action"])
 
     def test_it_learns_two_blocks_and_measures_finite_numbers(self) -> None:
-        """Each batch gives a line of the log, and what the agent saves changes."""
+        """A line of the log per batch; the agent's state changes."""
         curriculum = self.curriculum()
         agent, log = self.learnt(curriculum)
         lines = log.of_kind("training")
@@ -95,7 +95,7 @@ class AgentContract:
         assert sum_of_state(one.state_dict()) == sum_of_state(other.state_dict())
 
     def test_a_run_resumes_from_a_saved_state_with_the_same_bits(self) -> None:
-        """The state within each block, which PyTorch saves and loads without code, in an agent of another seed."""
+        """Saved by PyTorch within each block, loaded without code in an agent of another seed."""
         curriculum = self.curriculum()
         states = []
         whole, log = self.learnt(curriculum, checkpoint=lambda state, ends: states.append(_bytes(state())))
@@ -112,11 +112,11 @@ class MethodContract(AgentContract):
     """Tests of a lifelong-learning method on an agent. Override `make_agent` and `make_method`."""
 
     def make_method(self) -> MethodLike:
-        """Return a new method; override it."""
+        """Return a new method."""
         raise NotImplementedError
 
     def curriculum(self) -> Curriculum:
-        """Return what the method makes of the two small tasks."""
+        """Return the method's curriculum of the two small tasks."""
         return self.make_method().prepare(super().curriculum())
 
     def build(self, curriculum: Curriculum, seed: int = 0) -> Agent:
