@@ -65,7 +65,7 @@ DISSIMILAR = {(2, 2): (1, 2), (3, 2): (3, 1), (2, 3): (2, 1, 2), (3, 3): (2, 3, 
 
 
 def configured(configuration: str, image_seed: int = 1) -> Task:
-    """The task of a configuration such as ``su_b1``, with the goal (1, 1, ...).
+    """The task of a configuration such as ``su_b1``, its goal at the first branches.
 
     Raises:
         ValueError: for an unknown configuration; lists the choices.
