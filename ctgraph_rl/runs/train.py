@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from inspect import signature
+from inspect import Signature, signature
 from pathlib import Path
 
 import torch
@@ -30,6 +30,7 @@ from ctgraph_rl.log.provenance import learners
 from ctgraph_rl.runs.checkpoints import Checkpoints
 from ctgraph_rl.runs.experts import Expert
 from ctgraph_rl.runs.session import OneBatch, RunMember, Session
+from ctgraph_rl.runs.settings import parameters_of
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 MakeAgent = Callable[[Composite, TensorSpec], Agent]
@@ -81,6 +82,9 @@ def _takes_specs(make_agent: Callable[..., object]) -> Rule:
     """The rule that a function takes the two specs."""
     try:
         signature(make_agent).bind(None, None)
+        if isinstance(make_agent, type):
+            parameters = sorted(parameters_of(make_agent).values(), key=lambda each: each.kind)
+            Signature(parameters).bind(None, None)
     except TypeError as error:
         name = getattr(make_agent, "__name__", type(make_agent).__name__)
         return False, f"make_agent must take two specs and nothing else, {name}: {error}; bind the rest, by partial"

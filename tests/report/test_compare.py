@@ -13,6 +13,7 @@ from helpers.made_runs import write_run
 
 from ctgraph_rl import cli
 from ctgraph_rl.log.files import AGENT, LOG
+from ctgraph_rl.log.provenance import NUMBERS
 
 DOUBLED_LIST: list = []
 for _ in range(60):
@@ -135,7 +136,7 @@ def test_other_settings_code_and_machines_are_named(pair, said):
         "settings: different, portable False and True, seed 0 and 1",
         "curriculum: different, fingerprint 'f' and 'g', source 'a test' and 'x'",
         "machine: different, machine 'x86_64' and 'arm', num_threads 1 and 2",
-        "code: different, numbers None and 7",
+        f"code: different, numbers {NUMBERS} and 7",
     ]
 
 
