@@ -253,7 +253,6 @@ class PEARL(Learner):
             yield {**self._steps(*trial, self.settings.batch_size), **context, "noise": noise}
 
     def _store(self, batch: TensorDictBase) -> None:
-        """Append a batch to each row's steps, and drop the oldest."""
         begins = batch["is_init"] & (batch["next", "trial"] == 1)
         keys = [*self.specs, "action", ("next", "reward"), ("next", "terminated")]
         keys += [("next", key) for key in self.specs]

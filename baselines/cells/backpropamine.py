@@ -90,7 +90,6 @@ class Backpropamine(Cell):
         return PlasticSequence.apply(steps, given, *self._plastic(), *state)
 
     def _plastic(self) -> Plastic:
-        """Return all weights but those of the inputs."""
         rate = None if self.modulation == "simple" else self.rate
         if self.modulation == "none":
             return Plastic(self.recurrent, self.plasticity, rate)

@@ -42,7 +42,6 @@ def max_scan(inputs: Tensor, starts: Tensor) -> Tensor:
 
 
 def _distances(inputs: Tensor) -> Iterator[int]:
-    """Yield the powers of 2 below the number of steps."""
     return (2**power for power in range((inputs.shape[1] - 1).bit_length()))
 
 

@@ -128,7 +128,6 @@ class ADWIN(Detector):
         return after.mean < before.mean
 
     def _accepted(self) -> Verdict:
-        """Return the label on trial if its returns match the kept ones."""
         kept = self.kept.get(self.label)
         seen = returns_of(self.returns)
         if kept is None or seen.number < self.num_trial_episodes:

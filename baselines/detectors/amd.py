@@ -168,7 +168,6 @@ class AMD(Detector):
         return torch.stack(steps, dim=-1).flatten(0, 1)
 
     def _learn(self, steps: Tensor) -> None:
-        """Count steps, int64 [N, 3], for the present label."""
         history, action, following = steps.unbind(1)
         self.models[self.label].add(history * self.num_outcomes + action * self.num_observations + following)
 
@@ -187,7 +186,6 @@ class AMD(Detector):
         return self._label_for([min(1.0, len(windows) * p_value) for p_value in smallest])
 
     def _label_for(self, p_values: list[float]) -> int:
-        """Return the label that fits by all p-values."""
         present = p_values[self.label]
         best = max(p_values)
         if present == best or (self.keeps_fitting and present >= self.threshold):

@@ -147,7 +147,6 @@ class SWOKS(Detector):
             self.distances[label] = []
 
     def _update(self, window: Tensor) -> Verdict:
-        """Measure a window's distances, and test those of the label."""
         self.num_points += len(window)
         if not self.is_trial:
             self.history = [*self.history, window.clone()][-self.num_windows - 1 :]
@@ -155,7 +154,6 @@ class SWOKS(Detector):
         return self._accepted() if self.is_trial else self._suspicion()
 
     def _measure(self, window: Tensor) -> None:
-        """Measure a window's distance from each reference."""
         references = dict(self.references)
         if len(self.history) > WINDOWS_BEFORE:
             references[self.label] = self.history[0]
@@ -167,7 +165,6 @@ class SWOKS(Detector):
             self.distances[label] = [*self.distances[label], distance][-self.num_kept :]
 
     def _accepted(self) -> Verdict:
-        """Return the label on trial if it is accepted."""
         earlier = self.earlier[self.label]
         newest = self.distances[self.label][-self.num_tested :]
         enough = len(newest) == self.num_tested and self.num_points >= self.num_fresh * self.window

@@ -154,7 +154,6 @@ class CKARL(TaskMethod):
         return self.present_with(task, self.in_scope, self.kept)
 
     def _within(self, tensors: Sequence[Tensor]) -> list[Tensor]:
-        """Return the weights, or gradients, in scope."""
         return [each for each, inside in zip(tensors, self.inside, strict=True) if inside]
 
     def _add(self, vector: Tensor) -> None:

@@ -106,7 +106,6 @@ class MaskAMSC(SelectedMasks):
         return total / max(number, 1)
 
     def _evaluated(self) -> float:
-        """Return the mean return of the curriculum's evaluation."""
         how = self.curriculum.evaluation
         agent = self.agent
         played = evaluate(

@@ -232,7 +232,6 @@ class InnerPolicy(TensorDictModuleBase):
         return tensordict
 
     def _own(self, theta: NamedWeights, data: Data, rewards: Tensor, *, fresh: Tensor, adapts: Tensor) -> NamedWeights:
-        """Return the weights of all rows, new ones for those that begin a trial or adapt."""
         own = {name: data[key] for name, key in self.own_keys.items()}
         if adapts.any():
             seen = tuple(data[key][adapts] for key in self.kept_keys)
@@ -433,7 +432,6 @@ class InnerLoop(Learner):
         return vmap(self.model.adapted_logits, in_dims=(None, 0, 0))(theta or self.model.theta, before, after)
 
     def _seen_before(self, batch: Data) -> NetInputs:
-        """Return what the network reads of the steps before the adaptation."""
         return tuple(batch["before", key] for key in self.specs)
 
     def loss(self, batch: Data) -> TensorsByName:

@@ -102,7 +102,6 @@ class _Transport:
 
 
 def _arcs(source: int, column: int, came_from: Ints, came_by: Ints) -> tuple[Arcs, Arcs]:
-    """Trace a path back from its last column to its first row."""
     row = int(came_from[column])
     forward = [(row, column)]
     backward = []

@@ -203,7 +203,6 @@ class CapturedGroup(SeedGroup):
         return written["state_value"].flatten(0, 1)
 
     def _transformed(self, minibatch: TensorsByName) -> TensorsByName:
-        """Return what the methods learn from in place of a minibatch."""
         if not self.methods:
             return minibatch
         parts = [{key: value[number] for key, value in minibatch.items()} for number in range(len(self.methods))]

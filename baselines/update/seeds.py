@@ -168,7 +168,6 @@ class SeedGroup:
         return self._outputs(*inputs)
 
     def _compile(self, graph: GraphModule, inputs: Sequence[Tensor]) -> Outputs:
-        """Compile a graph, or return that of an equal one."""
         if graph.code not in self._compiled:
             self._compiled[graph.code] = compile(graph, [*inputs], compiler_options())
         return self._compiled[graph.code]
@@ -241,7 +240,6 @@ class SeedGroup:
         return [or_error(measured, *pair) for pair in zip(stack.learners, table, strict=True)]
 
     def _next(self, minibatches: Mapping[int, Iterator[Items]]) -> list[Data]:
-        """Return each agent's next minibatch; none after the last."""
         given = []
         for number, iterator in minibatches.items():
             with self.random(number):
@@ -272,7 +270,6 @@ class SeedGroup:
         return {key: value for key, value in measured.items() if value.ndim == 1}
 
     def _step(self, stack: Stack, batch: Items) -> TensorsByName:
-        """Take a stack's gradient step, compiled for usual minibatches where the agents set it."""
         first = stack.learners[0]
         usual = batch["action"].shape[1] == first.minibatch_size
         function = first.compiled_step if usual and first.compiled_step is not None else update
@@ -299,7 +296,6 @@ def _gains_from_stacking(learner: Learner) -> bool:
 
 
 def _most_at_once(learner: Learner) -> int:
-    """Return how many seeds' tensors stay in the cache between compiled steps."""
     of_one = sum(4 * parameter.numel() * parameter.element_size() for parameter in learner.weights)
     return max(1, CACHED_BYTES // of_one)
 

@@ -92,7 +92,6 @@ class Stack:
                 torch._foreach_copy_([state[key] for state in states], values)
 
     def _states(self) -> list[list[TensorsByName]]:
-        """Return the optimisers' states of each trained parameter, one of each learner."""
         parts = [cast(Parts, parts_of(learner.optimiser)) for learner in self.learners]
         return [list(states) for states in zip(*(each.state for each in parts), strict=True)]
 

@@ -121,7 +121,6 @@ def _losses(learner: Trained, weights: Sequence[Tensor], batch: Data, others: Da
 
 
 def _seen(state: UpdateState) -> TensorsByName:
-    """Return several seeds' tensors as the networks see them."""
     tensors = state.tensors or {}
     return {name: value.mT if name in state.turned else value for name, value in tensors.items()}
 

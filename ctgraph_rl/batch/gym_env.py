@@ -198,7 +198,6 @@ class GymEnv(EnvBase):
         return self._shown(data).set("reward", reward)
 
     def _read(self, row: int, read: Callable[[Any], T], returned: Any) -> T:
-        """Read what an environment returned; errors name the place."""
         try:
             return read(returned)
         except (ValueError, FloatingPointError) as error:
@@ -226,7 +225,6 @@ class GymEnv(EnvBase):
         return data
 
     def _episode_seed(self, row: int) -> int:
-        """Return the seed of a row's present episode, in [0, 2**31)."""
         sequence = np.random.SeedSequence((self.seed, row, int(self._episode[row])))
         return int(sequence.generate_state(1)[0] >> 1)
 
@@ -326,7 +324,6 @@ def _reset(env: Any, seed: int) -> Any:
 
 @cache
 def _repeats_rule(task: GymTask, key: Any) -> Rule:
-    """Return the rule that an episode repeats with its seed, in one environment and in another."""
     if not task.repeats:
         return True, ""
     envs: list[Any] = []

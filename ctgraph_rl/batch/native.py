@@ -185,7 +185,6 @@ class Native:
         made: Shown | Stepped | None = None,
         **arrays: Tensor | None,
     ) -> tuple[RowState, int]:
-        """Call the kernel; return the states, and how often it met an error."""
         if torch.compiler.is_compiling():  # which cannot look into the call; disabling it takes 50 µs
             run = torch.compiler.disable(self._run)
             return run(state, num_steps, restarts, most_action, made, **arrays)

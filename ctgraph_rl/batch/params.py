@@ -44,7 +44,6 @@ class _Different:
         return torch.tensor(numbers, dtype=torch.int64, device=self.device)
 
     def some(self, value: TaskValue) -> bool:
-        """Return whether the value of any task is true."""
         return any(self._values(value))
 
     def _values(self, value: TaskValue) -> Iterator[Any]:

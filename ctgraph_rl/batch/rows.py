@@ -119,7 +119,6 @@ class Rows(TakesNumbers, nn.Module):
         return self.row.device
 
     def _choose_engine(self) -> None:
-        """Find out whether the kernel can run; raise if it cannot but is required."""
         reward_fns = [task.reward_fn for task in self.pool]
         if self.kernel == "required":
             require_kernel(reward_fns, self.device)
@@ -203,7 +202,6 @@ class Rows(TakesNumbers, nn.Module):
             self._restart(chosen)
 
     def _restart(self, assignment: Assignment) -> None:
-        """End all episodes; the next ones are the first with these choices and goals."""
         self.assignment = assignment.restarted()
         self._make_tables()
         self._end_episodes()

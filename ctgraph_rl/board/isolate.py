@@ -258,7 +258,6 @@ def run_isolated(
 
 
 def _wait(process: subprocess.Popen[bytes], folder: Path, limits: Limits) -> str | None:
-    """Wait for a process; return the limit that it broke, if any."""
     end = time.monotonic() + limits.seconds
     while True:
         try:
@@ -272,7 +271,6 @@ def _wait(process: subprocess.Popen[bytes], folder: Path, limits: Limits) -> str
 
 
 def _why_too_much(folder: Path, disk: int) -> str | None:
-    """Return why a folder holds more than it may, if it does."""
     closed = ["-type", "d", "(", "!", "-readable", "-o", "!", "-executable", ")", "-printf", "closed\n"]
     command = ["find", str(folder), "-xdev", *closed, "-o", "-printf", "%b\n"]
     blocks = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True).stdout.split()
@@ -373,7 +371,6 @@ def _set(path: Path, value: object) -> None:
 
 
 def _remove_cgroups(groups: Sequence[Path]) -> None:
-    """Remove cgroups once the last of their killed processes is gone."""
     end = time.monotonic() + SECONDS_TO_START
     for group in groups:
         while True:

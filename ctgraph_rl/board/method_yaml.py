@@ -46,7 +46,6 @@ failed: {}                  # seeds of runs without results, each with the reaso
 EXAMPLE: ReadOnlyValues = yaml.safe_load(TEMPLATE)
 
 MOST_BYTES = 2**16
-"""Largest ``method.yaml`` that is read."""
 
 HOURS_APART, SHARE_APART = 0.01, 0.05
 """How far the hours of a ``method.yaml`` may be from those of the logs."""
@@ -92,7 +91,6 @@ HOURS = or_null(Kind(lambda value: is_real(value, 0), "a number >= 0"))
 
 
 def _are_reasons(value: object) -> bool:
-    """Whether it has a text for each of some seeds."""
     return isinstance(value, Mapping) and are_ints(list(value), 0) and all(map(TEXT.holds, value.values()))
 
 

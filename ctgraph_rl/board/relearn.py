@@ -81,14 +81,12 @@ def configuration(stored: ReadOnlyValues) -> DictConfig:
 
 
 def _settings(job: Relearning, seed: int) -> NamedValues:
-    """Return the settings of a seed, with the curriculum of the job's file, if any."""
     target = "ctgraph_rl.tasks.curriculum.Curriculum.from_json"
     own = {} if job.curriculum is None else {"curriculum": {"_target_": target, "path_or_dict": job.curriculum}}
     return {**job.config, "seed": seed, **own}
 
 
 def _call(job: Relearning, run_dir: Path) -> None:
-    """Call the entry point of a learner of others."""
     module, _, name = str(job.entry_point).partition(":")
     function = getattr(import_module(module), name, None)
     require(

@@ -196,7 +196,6 @@ def result_of(cell: RerunCell, seed: int, outcome: Outcome) -> Rerun:
 
 
 def _experts(folder: Path, log: RunLog) -> tuple[RunLog, ...]:
-    """Return the logs of a log's single-task experts, which must be in the folder of its process."""
     logs = []
     for each in experts_of(log):
         path = (folder / str(each.get("run")) / LOG).resolve()

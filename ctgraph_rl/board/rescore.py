@@ -97,7 +97,6 @@ def scores_of(submission: Submission, run: SubmittedRun) -> dict[str, float | No
 
 
 def _of_the_whole(submission: Submission) -> Iterator[Check]:
-    """Yield checks of curriculum, seeds and method."""
     method = submission.method
     runs = submission.runs
     of_track = submission.track
@@ -123,13 +122,11 @@ def _of_the_whole(submission: Submission) -> Iterator[Check]:
 
 
 def _rules(what: str, rules: Sequence[Rule], expected: str, found: str) -> Check:
-    """Return a check of rules, with the messages of broken ones."""
     broken = "; ".join(message for holds, message in rules if not holds)
     return Check(what, expected, found, not broken, note=broken)
 
 
 def _of_the_log(submission: Submission, run: SubmittedRun, log: RunLog) -> Iterator[Check]:
-    """Yield checks of a log against the other files."""
     yield equal("sum of the log", run.log_sha256, log_sum(log), run.run)
     about = (log.of_kind("run") or [{}])[0]
     config = dict(about.get("config") or {})
@@ -148,7 +145,6 @@ def _of_the_log(submission: Submission, run: SubmittedRun, log: RunLog) -> Itera
 
 
 def _of_experts(submission: Submission, run: SubmittedRun, log: RunLog) -> Iterator[Check]:
-    """Yield checks that the logs of experts are those that a log names."""
     said = experts_of(log)
     experts = submission.experts(run, log) or ()
     yield equal("sums of the logs of experts", run.experts, tuple(map(log_sum, experts)), run.run)

@@ -37,7 +37,6 @@ SUBMISSION = "submission.json"
 LOGS = "logs"
 
 VERIFICATION = "verification.json"
-"""The file that a verification writes."""
 
 SCHEMA = 2
 """Of ``submission.json``."""
@@ -265,7 +264,6 @@ def _curriculum(content: ReadOnlyValues, of_track: Track | None) -> Curriculum:
 
 
 def _check_fields(given: Any, fields: Mapping[str, Field], what: str, owner: str = "") -> None:
-    """Refuse what is no object of these fields."""
     whole = isinstance(given, dict) and {*given} == {*fields}
     require((whole, f"{what} {', '.join(fields)}, got {given!r:.80}"))
     require(*kind_rules(given, {name: field.kind for name, field in fields.items()}, owner))

@@ -95,7 +95,6 @@ def submit(
 
 
 def _found(paths: Sequence[Path], only: ReadOnlyValues) -> list[Run]:
-    """Return the runs with some settings, by seed; refuse what cannot be read."""
     found, problems = find_runs(paths)
     require((not problems, why_left_out(problems)))
     chosen = []
@@ -138,7 +137,6 @@ def _checked(
 
 
 def _experts(run: Run) -> dict[int, Path]:
-    """Return the logs of a run's single-task experts by the numbers of their tasks."""
     return {each["task"]: Path(str(each.get("run"))) / LOG for each in experts_of(RunLog.read(run.path / LOG))}
 
 
@@ -150,7 +148,6 @@ def _names(runs: Sequence[Run]) -> list[str]:
 
 
 def _line(run: Run, name: str, reason: str | None, experts: Mapping[int, Path]) -> SubmittedRun:
-    """Return a run as ``submission.json`` has it."""
     log = RunLog.read(run.path / LOG)
     agent = run.path / AGENT
     state = None
@@ -193,7 +190,6 @@ def same_rules(runs: Sequence[Run]) -> Iterator[Rule]:
 
 
 def _differing(given: Sequence[ReadOnlyValues], absent: object = None) -> dict[str, str]:
-    """Return the names that have several values, with these in words."""
     found = {}
     for name in dict.fromkeys(chain(*given)):
         values: dict[str, None] = {}

@@ -301,7 +301,6 @@ def _ended_by_signals(message: str) -> Iterator[None]:
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    """Refuse values out of range."""
     number = arguments.number
     code = arguments.code
     hours = arguments.hours

@@ -78,7 +78,6 @@ def run_collective(cfg: Any, run_dir: Path) -> None:
 
 
 def _learn(session: Session, cfg: Any, cells: Sequence[ConfigAndPath], exchange: ExchangeLike, run_dir: Path) -> None:
-    """Build all members, let them learn, and write the results."""
     with Interrupt() as interrupt, mark_failure(run_dir):
         members = _members(cells, interrupt)
         _warn_of_long_ids([member.curriculum for member in members])
@@ -152,7 +151,6 @@ class Exchanging(SessionCoupling):
         self.checkpoints.clear()
 
     def _log(self, members: Sequence[RunMember]) -> RunLog:
-        """Return the collective's log, new or from a checkpoint."""
         run_dir = self.run_dir
         if self.saved is not None:
             (run_dir / METRICS).unlink(missing_ok=True)
@@ -170,7 +168,6 @@ class Exchanging(SessionCoupling):
 
 
 def _warn_of_long_ids(curricula: Sequence[Curriculum]) -> None:
-    """Warn, before members learn, that long task ids make them slow and large."""
     longest = max(curricula, key=lambda each: each.protocol.length(len(each.tasks)))
     length = longest.protocol.length(len(longest.tasks))
     if longest.protocol.task_id == "one_hot" and length > LONG_ID:
@@ -183,11 +180,6 @@ def _warn_of_long_ids(curricula: Sequence[Curriculum]) -> None:
 
 
 def _members(cells: Sequence[ConfigAndPath], interrupt: Interrupt) -> list[RunMember]:
-    """Build all members.
-
-    Raises:
-        ValueError: names the member.
-    """
     members = []
     for number, (cfg, folder) in enumerate(cells):
         try:
@@ -199,7 +191,6 @@ def _members(cells: Sequence[ConfigAndPath], interrupt: Interrupt) -> list[RunMe
 
 
 def _is_replaced(cfg: Any, cells: Sequence[ConfigAndPath]) -> bool:
-    """Return whether the collective begins again, whatever its directory holds."""
     if cfg.overwrite != config.STALE:
         return bool(cfg.overwrite)
     begun = [(first_line(folder), code_of(each, {})) for each, folder in cells]

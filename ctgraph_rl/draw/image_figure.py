@@ -65,7 +65,6 @@ def _make_plain_lines(task: Task) -> list[ImageLine]:
 
 
 def _make_varied_lines(task: Task, seed: int) -> list[ImageLine]:
-    """Return a line for each of the first ids of each kind of state."""
     shown: list[tuple[StateType, int]] = []
     for kind in StateType:
         shown += product([kind], _first_ids(task, kind, MOST_IDS))

@@ -219,7 +219,6 @@ def _ring(inner: float, outer: float) -> NDArray[np.int64]:
 
 
 def _fill(canvas: Pixels, centres: NDArray[np.float64], offsets: NDArray[np.int64], colour: int) -> None:
-    """Colour the offsets around every centre (x, y), within the canvas and below the states."""
     middles = (centres * SCALE).round().astype(np.int64)
     points = (middles[:, None] + offsets).reshape(-1, 2).T
     inside = (points.min(0) >= 0) & (points.max(0) < len(canvas))

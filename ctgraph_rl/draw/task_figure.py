@@ -134,7 +134,6 @@ class _TaskPicture:
         return max(2.0, min(LARGEST_MARK, share * beside, 0.55 * below)), beside
 
     def draw(self, legend: bool) -> None:
-        """Draw everything."""
         self._draw_edges()
         self._draw_states()
         self._draw_goal()

@@ -188,7 +188,6 @@ class _Learner:
 
     @contextmanager
     def drawing(self) -> Iterator[None]:
-        """Replace torch's global generators by those of this member."""
         before = torch.get_rng_state()
         before_cuda = self._cuda_state()
         torch.set_rng_state(self.random)
@@ -209,7 +208,6 @@ class _Learner:
             torch.cuda.set_rng_state(state, self.device)
 
     def advance(self) -> bool:
-        """Learn from the next batch; False at the end of the curriculum."""
         if self.is_done:
             return False
         with self.drawing():
@@ -237,10 +235,8 @@ class _Collective:
         self.rounds = 0
         self.learners: list[_Learner] = []
         self.advanced: list[_Learner] = []
-        """Those that have learned in this round."""
 
     def start(self, device: torch.device, saved: ReadOnlyValues | None) -> None:
-        """Start all members, from a saved state if there is one."""
         states: Sequence[Any] = [None] * len(self.members) if saved is None else saved["members"]
         count = f"the saved state has {len(states)} members, there are {len(self.members)}; start again"
         require((len(states) == len(self.members), count))
@@ -258,12 +254,10 @@ class _Collective:
 
     @property
     def frames(self) -> int:
-        """Frames that all members have learned from."""
         return sum(learner.steps.frames for learner in self.learners)
 
     @property
     def block(self) -> int:
-        """The highest present block, from 1."""
         return max(learner.steps.block for learner in self.advanced)
 
     @property
@@ -272,16 +266,13 @@ class _Collective:
 
     @property
     def is_at_block_end(self) -> bool:
-        """Whether a member's last batch ends a block."""
         return any(learner.steps.is_at_block_end for learner in self.advanced)
 
     @property
     def can_resume(self) -> bool:
-        """Whether all can resume from this state with the same bits."""
         return all(learner.steps.can_resume for learner in self.learners)
 
     def advance(self) -> bool:
-        """Let each member learn from a batch, then exchange messages if due; False if none has learned."""
         self.advanced = [learner for learner in self.learners if learner.advance()]
         for learner in self.advanced:
             self.exchange.observe(learner.number, learner.steps.batch, learner.steps.returns[0])
@@ -291,7 +282,6 @@ class _Collective:
         return bool(self.advanced)
 
     def _exchange(self) -> None:
-        """Send messages kind after kind, and let members use the last."""
         self.mail.begin()
         received: dict[int, list[Message]] = {number: [] for number in range(len(self.members))}
         for kind in self.exchange.kinds:
@@ -331,7 +321,6 @@ class _Collective:
         return {"block": self.members[number].curriculum.block_at(frames), "frames": frames}
 
     def state(self) -> NamedValues:
-        """Return all that the rest of the run depends on, as tensors and plain values."""
         return {
             "frames": self.frames,
             "rounds": self.rounds,

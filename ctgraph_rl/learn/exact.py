@@ -186,8 +186,6 @@ def _measure_function(policy: ActionProbs | nn.Module, task: Task, gamma: float)
 
 @dataclass(frozen=True)
 class _Function:
-    """A function of images, as a policy with ``action_probs``."""
-
     function: ActionProbs
     num_actions: int
 
@@ -268,7 +266,6 @@ class _Histories:
     state: Step
 
     def select(self, rows: Tensor) -> _Histories:
-        """Return some of them; a row may be taken several times."""
         state = {key: value.index_select(0, rows) for key, value in self.state.items()}
         return _Histories(self.node[rows], self.weight[rows], self.discount[rows], state)
 
@@ -287,7 +284,6 @@ class _Enumeration:
         self.sums = Measures(0.0, 0.0, 0.0, 0.0)
 
     def measures(self, start: Step) -> Measures:
-        """Return the measures of all histories that begin with a recurrent state of one row."""
         ones = torch.ones(1, dtype=torch.float64, device="cpu")
         self._at_home(_Histories(torch.zeros(1, dtype=torch.int64, device="cpu"), ones, ones, start))
         return self.sums
@@ -385,11 +381,9 @@ class _Enumeration:
         self.sums.return_mean += self.task.step_reward * (histories.weight * histories.discount).sum().item()
 
     def _fail(self, seen: _Histories, chance: Tensor) -> None:
-        """End a share of the histories in the fail state."""
         self.sums.return_mean += self.task.fail_reward * (seen.weight * seen.discount * chance).sum().item()
 
     def _arrive(self, histories: _Histories) -> None:
-        """End all histories, which have just reached their end states."""
         graph = self.task.graph
         leaf = histories.node - graph.first_node(graph.depth)
         before = histories.discount / self.gamma if self.gamma else torch.zeros_like(histories.discount)

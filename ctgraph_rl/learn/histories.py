@@ -147,6 +147,5 @@ def _sums(words: Tensor) -> Tensor:
 
 @cache
 def _weights(count: int) -> Tensor:
-    """Return fixed random odd numbers, int64 [count]."""
     generator = torch.Generator(device="cpu").manual_seed(0)
     return torch.randint(-(2**62), 2**62, [count], generator=generator, dtype=torch.int64, device="cpu") | 1

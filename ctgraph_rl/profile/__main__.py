@@ -52,7 +52,6 @@ def main() -> None:
 
 
 def _train(settings: dict[str, str], config_dir: Path | None) -> bool:
-    """Run the sweep; return whether all cells are done, and exit if it could not begin."""
     sys.argv = ["ctgraph-rl", "-m", *(f"{key}={value}" for key, value in settings.items())]
     if config_dir is not None:
         sys.argv.append(f"--config-dir={config_dir}")

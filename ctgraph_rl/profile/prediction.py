@@ -151,7 +151,6 @@ def _episodes(task: Task, policy: type[RandomPolicy], choices: TensorDictBase) -
 
 
 def _numbers(observation: Tensor, choices: TensorDictBase) -> Tensor:
-    """Return the numbers of images, int64 [rows, steps]."""
     images = choices["observation"][::2].flatten(1)
     flat = observation.flatten(2)
     return (flat[:, :, None] == images).all(-1).long().argmax(-1)

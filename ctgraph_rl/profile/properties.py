@@ -161,11 +161,6 @@ def predicts(run: Evidence, controls: Sequence[Evidence]) -> Measured:
 
 
 def _parts(values: Sequence[Any], sizes: Sequence[int]) -> list[Sequence[Any]]:
-    """Return values in groups of some sizes.
-
-    Raises:
-        Undefined: where the counts differ.
-    """
     if sum(sizes) != len(values):
         raise Undefined(f"the property has {sum(sizes)} tasks, this curriculum has {len(values)}")
     parts = []

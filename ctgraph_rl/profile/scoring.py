@@ -232,11 +232,6 @@ def _results(
 
 
 def _over_seeds(runs: RunsByName, name: str, prop: Any, read: dict[Path, Evidence]) -> dict[int, Measured]:
-    """Return what each seed measured; each run is read once.
-
-    Raises:
-        Undefined: where one measured nothing, with the reason and the remedy.
-    """
     results = {}
     for seed, run in sorted(runs[name].items()):
         needed = []
@@ -284,7 +279,6 @@ def _evidence(run: Run) -> Evidence:
 
 
 def _lacking(log: RunLog, curriculum: Curriculum) -> str:
-    """Return how the evaluations of a log differ from those of its curriculum, if they do."""
     evaluator = Evaluator(curriculum, 0, RunLog())
     due: Counter[tuple[int, int]] = Counter()
     for frames in curriculum.moments:
@@ -299,7 +293,6 @@ def _lacking(log: RunLog, curriculum: Curriculum) -> str:
 
 
 def _command(run: Run, curriculum: str = "") -> str:
-    """Return the command that trains a run, or another curriculum with its agent and seed, in the same folder."""
     curriculum = curriculum or run.group[0]
     typed = run.path / ".hydra" / "overrides.yaml"
     if not typed.exists():

@@ -224,7 +224,6 @@ def write_tidy(path: Path, runs: Sequence[Run]) -> None:
 
 
 def _lines(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[MeasureLine]:
-    """Yield a line for each metric, one for all if no run finished, and those of how tasks ended."""
     runs = by_seed.values()
     definitions: dict[str, str] = {}
     tasks: dict[str, None] = {}
@@ -271,7 +270,6 @@ def _metric(by_seed: BySeed, name: str, bounds: BoundsOfRuns, kind: str) -> Esti
 
 
 def _over_seeds(values: Sequence[float | None], bounds: statistics.LowHigh, kind: str) -> Estimate:
-    """Return seeds' values as one number, by one of `ctgraph_rl.parsers.STATISTICS`."""
     if kind == "t":
         return mean(values)
     if kind == "std":

@@ -140,7 +140,6 @@ class SelectedMasks(MaskLC):
         self.every = every
         self.embeddings = TaskEmbeddings(**embedding)
         self.selected: list[int] = []
-        """The slots of the selected tasks."""
 
         self.num_batches = 0
         """Of the present task."""

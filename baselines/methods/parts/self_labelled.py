@@ -257,7 +257,6 @@ class SelfLabelledAgent(nn.Module):
         self._resume(label)
 
     def _resume(self, label: int) -> None:
-        """Learn the started label."""
         self.label = label
         self.num_labels = max(self.num_labels, label + 1)
         self.home = None
@@ -268,11 +267,9 @@ class SelfLabelledAgent(nn.Module):
             self._take_snapshot()
 
     def _take_snapshot(self) -> None:
-        """Take a snapshot, and keep the newer of the earlier ones."""
         self.snapshots = [*self.snapshots[-1:], {"state": deepcopy(self.learner.state_dict()), "frames": 0}]
 
     def _learned(self, num_frames: int) -> None:
-        """Count learned frames, and take a snapshot if due."""
         if self.snapshots:
             self.snapshots[-1]["frames"] += num_frames
             if self.snapshots[-1]["frames"] >= cast(int, self.detector.snapshot_every):
@@ -290,7 +287,6 @@ class SelfLabelledAgent(nn.Module):
         return undone
 
     def _restore(self) -> None:
-        """Restore the older snapshot, if there is one."""
         for snapshot in self.snapshots[:1]:
             self.learner.load_state_dict(deepcopy(snapshot["state"]))
 
@@ -305,7 +301,6 @@ class SelfLabelledAgent(nn.Module):
             self._accept(self.num_labels if self.num_labels < self.max_labels else cast(int, self.home))
 
     def _accept(self, label: int) -> None:
-        """Learn a label after a suspicion."""
         if label == self.home and self.snapshots:
             self._restore()
         elif label != self.label:

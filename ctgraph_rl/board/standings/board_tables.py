@@ -108,13 +108,11 @@ def _table(entries: Sequence[BoardEntry]) -> BoardTable:
 
 
 def _estimates(entry: BoardEntry) -> dict[str, Estimate]:
-    """Return each measure of an entry over seeds, with the package's interval for it."""
     bounds = bounds_of_curriculum(entry.variant.curriculum)
     return {name: bounds.estimate(name, values) for name, values in entry.values.items()}
 
 
 def _pairs(lines: Sequence[Standing]) -> dict[tuple[str, str], Comparison]:
-    """Return the comparison of the scores of every two lines, p-values corrected for their number."""
     found = {}
     for one, other in combinations(lines, 2):
         bounds = bounds_of_curriculum(one.entry.variant.curriculum).of_metric(one.entry.track.score)
@@ -123,7 +121,6 @@ def _pairs(lines: Sequence[Standing]) -> dict[tuple[str, str], Comparison]:
 
 
 def _ranked(line: Standing, pairs: Mapping[tuple[str, str], Comparison], count: int) -> Standing:
-    """Return a line with its rank among so many."""
     best = 1
     worst = count
     for (one, other), found in pairs.items():

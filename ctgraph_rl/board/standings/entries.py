@@ -226,7 +226,6 @@ def _check_verification(given: Any) -> None:
 
 
 def _is_check(value: Any) -> bool:
-    """Whether it has the fields of a `Check`."""
     if not isinstance(value, dict) or not {*value} <= {*Check._fields}:
         return False
     texts = {type(each) for name, each in value.items() if name != "passed"}

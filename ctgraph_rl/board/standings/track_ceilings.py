@@ -69,7 +69,6 @@ def in_words(ceilings: Ceilings) -> list[tuple[str, str]]:
 
 
 def _mean(tasks: Sequence[Task], value: Callable[[Task], float]) -> float | None:
-    """Return the mean of a value over tasks; None if one has none."""
     try:
         return sum(map(value, tasks)) / len(tasks)
     except ValueError:
@@ -98,7 +97,6 @@ def _one_policy(tasks: Sequence[Task], protocol: Protocol) -> float | None:
 
 
 def _most_reached(goals: Iterable[tuple[int, ...]]) -> int:
-    """Return the most goals that one sequence of decisions reaches."""
     counts = Counter(goals)
     return max(sum(n for goal, n in counts.items() if path[: len(goal)] == goal) for path in counts)
 

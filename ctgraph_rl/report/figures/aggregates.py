@@ -91,7 +91,6 @@ def probability_of_improvement(first: Scores, second: Scores, seed: int = 0) -> 
 
 
 def _drawn(values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return bootstrap samples of a task's seeds, float64 [samples, seeds]."""
     return values[rng.integers(len(values), size=(RESAMPLES, len(values)))]
 
 

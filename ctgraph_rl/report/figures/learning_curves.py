@@ -155,7 +155,6 @@ def _draw(axes: Any, look: Mapping[str, Any], pieces: Sequence[list[Point]], see
 
 
 def _finished(grid: Any, section: Section, ylabel: str) -> Any:
-    """Return a figure with one scale, names of axes and a legend of agents."""
     low = 0.0
     high = 1.0
     for axes in grid.ravel():
