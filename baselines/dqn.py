@@ -85,7 +85,6 @@ class DQN(QLearner):
         network.
 
         Args:
-            batch: transitions.
             others: the target network's weights; None: those of `other_weights`.
         """
         after = {key: batch["next", key] for key in self.greedy.in_keys}

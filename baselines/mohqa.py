@@ -103,7 +103,6 @@ class HebbianHead(nn.Module):
     """The weights W_h, and how eligibility and weights change.
 
     Args:
-        settings: of the agent.
         num_actions: rows of W_h.
     """
 
@@ -152,7 +151,6 @@ class ModulatedGreedy(TensorDictModuleBase):
         head: computes q, an ``nn.Module`` in a TensorDictModule.
         hebbian: computes u.
         exploration: replaces some actions by random ones.
-        settings: of the agent.
     """
 
     def __init__(

@@ -86,8 +86,6 @@ class PosteriorPolicy(TensorDictModuleBase):
         actor: maps what is seen and z to logits.
         encoder: maps what is seen, the one-hot action and the reward to mu_i, and to s_i before its softplus.
         seen_keys: what the networks see.
-        num_actions: actions of the task.
-        trial_episodes: episodes of a trial.
     """
 
     def __init__(
@@ -178,9 +176,6 @@ class PEARL(Learner):
 
     TorchRL's `DiscreteSACLoss` has one context for both losses, where the policy's must not reach the encoder, and
     hides its critics from a `Learner`.
-
-    Args:
-        settings: of `PEARLSettings`.
     """
 
     Settings = PEARLSettings

@@ -329,11 +329,7 @@ class PennASettings(Reproduction):
 
 
 class PennA(TensorDictModuleBase):
-    """A population that evolves and is its policy: each row has weights that last over a life's episodes.
-
-    Args:
-        settings: of `PennASettings`.
-    """
+    """A population that evolves and is its policy: each row has weights that last over a life's episodes."""
 
     Settings = PennASettings
     memory = True

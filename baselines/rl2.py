@@ -33,8 +33,6 @@ class TrialTrunk(TensorDictModuleBase):
 
     Args:
         trunk: a `recurrent` trunk that also reads ``previous``, [num_actions + 1].
-        num_actions: actions of the task.
-        trial_episodes: episodes of a trial.
     """
 
     def __init__(self, trunk: RecurrentModule, num_actions: int, trial_episodes: int) -> None:

@@ -38,7 +38,6 @@ class Attention(Cell):
     Args:
         num_outputs: width of the output; a multiple of ``num_heads``.
         num_frames: steps, including the present one.
-        num_heads: heads of attention.
     """
 
     state_keys = ("recurrent_state_frames",)

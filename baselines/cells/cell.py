@@ -31,9 +31,7 @@ class Cell(TakesNumbers, nn.Module):
     and reward, never the time.
 
     Args:
-        num_features: width of the features.
         num_outputs: width of what it writes.
-        num_actions: actions of the task.
         reads_action: also read the last action, one-hot; zeros at the start of an episode.
         reads_reward: also read the last reward; 0 at the start of an episode.
     """
@@ -91,7 +89,6 @@ class Cell(TakesNumbers, nn.Module):
         """Return the outputs at the ends of different histories, [num_histories, num_outputs].
 
         Args:
-            tree: the histories.
             inputs: [num_groups, num_inputs].
             groups: the group of each history's last inputs, int64 [num_histories].
             state: what the histories of length 1 continue, from `Tree.initial`.

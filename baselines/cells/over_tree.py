@@ -141,7 +141,6 @@ class GatesOverTree(torch.autograd.Function):
 
         Args:
             ctx: keeps what `backward` reads.
-            gated: the histories.
             given: products of inputs, [n, G].
             weight: of the first part of the state, [G, H].
             bias: of that product, [G], or None.

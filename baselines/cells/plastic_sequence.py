@@ -103,7 +103,6 @@ class PlasticGradient:
     """The gradient of a sequence, step by step from the last one.
 
     Args:
-        weights: of the layer.
         bound: of fast weights.
         units: of all steps, [steps, rows, H].
         state: after the last step.
@@ -134,7 +133,6 @@ class PlasticGradient:
         """Go back through a step.
 
         Args:
-            t: the step.
             by_units: the gradient by its units without the next step's share, [rows, H].
             state: before it.
             after: after it, before any reset.

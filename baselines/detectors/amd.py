@@ -62,7 +62,6 @@ class AMD(Detector):
         degrees: of freedom: published or corrected.
         keeps_fitting: the present label stays while it fits; False: the largest p-value decides.
         num_untested: steps of a new label before it is tested.
-        max_labels: most labels.
     """
 
     reads = "one-hot observations"

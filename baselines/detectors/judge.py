@@ -59,7 +59,6 @@ class Judge(TakesNumbers):
         Args:
             num_rows: rows of a batch.
             num_steps: steps of a batch; blocks may end with a shorter one.
-            num_actions: number of different actions.
             num_observations: number of one-hot observations; None for images.
 
         Raises:
@@ -84,7 +83,6 @@ class Judge(TakesNumbers):
         """Called when the next batch will be the first of a label.
 
         Args:
-            label: the label.
             trial: whether it is tried after a suspicion; False where learning begins or resumes with it.
         """
 

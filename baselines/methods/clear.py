@@ -26,9 +26,6 @@ class Reservoir:
     """A uniform random sample of all items that were offered.
 
     Vitter 1985, Algorithm R: item n takes a random one of n places, if the reservoir has it.
-
-    Args:
-        capacity: most items.
     """
 
     def __init__(self, capacity: int) -> None:

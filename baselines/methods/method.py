@@ -225,8 +225,6 @@ class AgentWithMethod(nn.Module):
 
     Args:
         agent: the agent, of which the method becomes a part.
-        method: the method.
-        curriculum: what will be learned.
 
     Raises:
         ValueError: if agent and method do not fit together.

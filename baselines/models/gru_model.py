@@ -24,7 +24,6 @@ class GRUModel:
     It does not reset at episodes' ends, which the home state shows. Learning minimises the mean bits by Adam.
 
     Args:
-        symbols: the images and rewards.
         seed: of the first weights and the order of rows.
     """
 

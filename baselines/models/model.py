@@ -103,7 +103,6 @@ def experience(
     """Return what a policy meets in a task.
 
     Args:
-        task: the task.
         symbols: of it and all tasks that the predictor meets.
         policy: an agent's ``policy``, which samples, or a class of `ctgraph_rl.policies`.
         num_steps: steps of each of 64 rows.
@@ -125,9 +124,7 @@ def learned_share(model: Predictor, test: Transitions, task: Task, policy: str =
     for a predictor that is wrong and sure.
 
     Args:
-        model: the predictor.
         test: transitions of the named policy that it has not learned from.
-        task: what they are of.
         policy: a name as for `transition_entropy`.
     """
     exact = transition_entropy(task, policy)

@@ -13,9 +13,6 @@ class TableModel:
 
     After counts n(c, s) of a pair s in a context c, P(s | c) = (n(c, s) + P(s)) / (n(c) + 1), with the share of all
     steps P(s) = (n(s) + 1) / (n + S) over S pairs; a new context gives the frequencies.
-
-    Args:
-        symbols: the images and rewards.
     """
 
     def __init__(self, symbols: Symbols) -> None:

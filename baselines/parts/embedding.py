@@ -31,7 +31,6 @@ def transitions(observation: Tensor, action: Tensor, reward: Tensor, num_actions
         observation: [N, ...], of any number type.
         action: int64 [N], in [0, num_actions).
         reward: [N].
-        num_actions: of the environment.
 
     Returns:
         float32 [N, n], n = pixels + num_actions + 1.

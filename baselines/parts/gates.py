@@ -63,7 +63,6 @@ class GatedNetwork(nn.Module):
         num_extra: width of further inputs.
         hidden_size: width of each layer.
         num_layers: layers before the output, which has no gate.
-        num_outputs: logits.
         gate: one of `GATES`.
         gate_size: as in `GatedLayer`.
     """

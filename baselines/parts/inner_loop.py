@@ -194,7 +194,6 @@ class InnerPolicy(TensorDictModuleBase):
         model: the weights, and how they adapt.
         seen_keys: what the network reads.
         adapt_episodes: episodes before and after the adaptation.
-        gamma: discount factor.
     """
 
     def __init__(self, model: InnerModel, seen_keys: list[str], adapt_episodes: int, gamma: float) -> None:
@@ -303,11 +302,7 @@ class InnerLoopSettings:
 
 
 class InnerLoop(Learner):
-    """A policy that adapts within a trial; subclasses say which weights adapt.
-
-    Args:
-        settings: of the class's `Settings`.
-    """
+    """A policy that adapts within a trial; subclasses say which weights adapt."""
 
     Settings: ClassVar[Any] = InnerLoopSettings
     settings: Any

@@ -342,8 +342,6 @@ def encoder(
 
     Args:
         observation_spec: the environment's, without batch dimensions.
-        num_features: width of the features.
-        num_layers: linear layers.
         kind: ``mlp`` or ``cnn``.
         extra: further keys to read, with their widths.
     """

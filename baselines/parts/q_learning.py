@@ -160,9 +160,6 @@ class QLearner(Learner):
 
     Subclasses call `set_networks` and define `require_room`, `experience` and the loss. A loss that takes ``others``
     gets the target network's weights.
-
-    Args:
-        settings: of the class's `Settings`.
     """
 
     Settings: ClassVar[Any] = QLearnerSettings

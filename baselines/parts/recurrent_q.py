@@ -29,7 +29,6 @@ class Quantiles(nn.Module):
     """A linear layer with K outputs per action, whose mean is the action's value.
 
     Args:
-        num_features: width of the input.
         num_actions: A.
         num_quantiles: K.
     """
@@ -64,11 +63,7 @@ class RecurrentQSettings(QLearnerSettings):
 
 
 class RecurrentQ(QLearner):
-    """Q-learning with a cell; subclasses define the distance of predictions from targets.
-
-    Args:
-        settings: of the class's `Settings`.
-    """
+    """Q-learning with a cell; subclasses define the distance of predictions from targets."""
 
     Settings: ClassVar[Any] = RecurrentQSettings
     memory = True

@@ -48,7 +48,6 @@ class Trained(nn.Module):
         """Return the agent's losses and the method's penalties.
 
         Args:
-            batch: a minibatch.
             weights: of the networks, by which the sum is differentiated.
             others: from `other_weights`, for a ``loss`` with an argument of this name.
         """

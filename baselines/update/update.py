@@ -77,7 +77,6 @@ def update(learner: Trained, state: UpdateState, batch: Data) -> TensorsByName:
     Args:
         learner: gives losses and method; with several seeds any of them.
         state: changed in place.
-        batch: a minibatch.
     """
     losses = losses_of(learner, state, batch)
     total = total_loss(losses)

@@ -42,7 +42,6 @@ class GymEnv(EnvBase):
         tasks: one for each row.
         seed: of all episodes, in [0, 2**63).
         task_pool: the tasks that `set_tasks` may be given. Default: ``tasks``.
-        device: of the tensors.
         task_ids: the id of each task, as in `TaskLike.make_env`.
         num_task_ids: length of ``task_id``; None: just enough.
 

@@ -95,7 +95,6 @@ class Native:
         """Start an episode in the rows of a mask, and step the others.
 
         Args:
-            state: where the rows are.
             action: int64 [N]; None: no row steps.
             mask: bool [N]; None: no row starts an episode.
             shown: uint8 [N, *shape], the last observations, if known and no row steps.
@@ -127,7 +126,6 @@ class Native:
         """Step all rows and start an episode in those that are done, as `step` and `restart` do, in one call.
 
         Args:
-            state: where the rows are.
             action: int64 [N].
             most_action: the highest action; -1 checks nothing.
 
@@ -163,8 +161,6 @@ class Native:
         """Call the kernel; return the states that it leads to.
 
         Args:
-            state: where to start.
-            num_steps: T.
             restarts: rows that a step finishes start an episode within it.
             made: new arrays to fill, which are not checked.
             arrays: those of ``_ARRAYS``, filled or read; with ``made``, only those that are read.

@@ -38,7 +38,6 @@ class Rows(TakesNumbers, nn.Module):
         seed: of all draws, in [0, 2**63).
         first_row: number of the first row, for a batch that is split.
         task_pool: the tasks that `set_tasks` may be given, which fix the images. Default: ``tasks``.
-        device: of the tensors.
         noise_bank: 0 draws noise for every pixel of every observation. M >= 1 takes an observation's noise from M drawn
             in advance, which is faster; two observations then share noise with probability 1 / M.
         kernel: whether the C kernel takes the steps, with the same bits. It needs a CPU, a C compiler and rewards of

@@ -88,7 +88,6 @@ def other_curriculum(curriculum: Curriculum, key: str) -> Curriculum:
     CT-graphs stay; only the seeds change.
 
     Args:
-        curriculum: what was learned.
         key: decides images and goals.
     """
 

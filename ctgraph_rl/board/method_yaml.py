@@ -204,7 +204,6 @@ def fact_rules(
     Args:
         method: content of a ``method.yaml``.
         facts: from `facts_of`.
-        runs: the submitted runs.
         num_tasks: of the curriculum.
     """
     rules = []

@@ -130,7 +130,6 @@ def job_of(
     """Return the job of seeds with the submitted configuration.
 
     Args:
-        submission: of which.
         seeds: one, or those of a group.
         run: a submitted run, whose number of threads counts.
         curriculum: file of another curriculum; None: the submitted one.
@@ -297,10 +296,7 @@ def check_of_scores(submission: Submission, found: Sequence[float], what: str, l
     """Test whether scores are lower than the submitted ones, and say what the test could find.
 
     Args:
-        submission: with the submitted scores.
         found: the other scores.
-        what: what they are.
-        level: of the verification.
         note: why scores are compared and not bits.
     """
     submitted = submitted_scores(submission)
@@ -319,7 +315,6 @@ def verified(submission: Submission, results: Mapping[SubmittedRun, Rerun], othe
     Bits are compared first. Where they differ and are not promised, scores are tested instead.
 
     Args:
-        submission: of the runs.
         results: of each run that was learned again.
         other_bits: from `why_other_bits`.
     """

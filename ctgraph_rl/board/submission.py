@@ -147,7 +147,6 @@ class Submission:
     """A submission as data.
 
     Args:
-        path: its folder.
         method: from ``method.yaml``.
         config: of all runs, without the seed.
         versions: of packages that computed them, by name.
@@ -201,7 +200,6 @@ def read_submission(path: Path | str, of_track: Track | None = None, config_dir:
     """Read a submission and check its form; `ctgraph_rl.board.rescore` checks its content.
 
     Args:
-        path: its folder.
         of_track: in place of the track that its method names.
         config_dir: where the user's tracks are, as ``track/NAME.yaml``.
 

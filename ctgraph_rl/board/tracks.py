@@ -78,11 +78,9 @@ class Track:
     Args:
         name: of the file.
         version: rises with every change that makes results incomparable.
-        title: for readers.
         measures: a sentence.
         breakthrough: a sentence.
         score: the metric that orders a table.
-        seeds: of a submission.
         rungs: settings of each rung; one without settings for a single curriculum.
         less_given: changes of the protocol for learners that are given less.
         config_dir: of the user's file; None: ours.

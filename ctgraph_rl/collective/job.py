@@ -101,9 +101,6 @@ class Exchanging(SessionCoupling):
     """A coupling of learners that exchange messages by `learn_collective`.
 
     Args:
-        cfg: the configuration of the collective.
-        exchange: what messages they send.
-        run_dir: the directory of the collective.
         checkpoints: those of all members together.
     """
 

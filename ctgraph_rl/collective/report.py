@@ -70,7 +70,6 @@ def write_report(paths: Sequence[Path | str], folder: Path) -> Path:
 
     Args:
         paths: directories of collectives, or folders that hold them.
-        folder: where the report goes.
 
     Raises:
         ModuleNotFoundError: before any work, without what the extra ``report`` installs.

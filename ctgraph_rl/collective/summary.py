@@ -55,11 +55,8 @@ class Collective:
     """A collective as data.
 
     Args:
-        path: its directory.
         about: the values of `RUN`.
-        config: the configuration.
         learned: of each member and block.
-        messages: a row for each exchange and kind of message.
         helps: what was taken over.
     """
 

@@ -34,7 +34,6 @@ def draw_graphs(curriculum: Curriculum, path: Path | str) -> None:
     """Draw the graphs and goals of a curriculum.
 
     Args:
-        curriculum: any curriculum.
         path: the picture; its ending decides the format.
 
     Raises:

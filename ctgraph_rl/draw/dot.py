@@ -21,10 +21,6 @@ def to_dot(task: Task, name: str = "") -> str:
 
     Beyond 1,024 end states only the path to the goal is written, with one node for the other branches of each decision
     state.
-
-    Args:
-        task: any task.
-        name: a title.
     """
     return "\n".join(["digraph {", *(f"  {line};" for line in _statements(task, name)), "}", ""])
 

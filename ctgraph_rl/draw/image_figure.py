@@ -39,7 +39,6 @@ def image_figure(task: Task, seed: int = 0) -> Any:
     of it; else eight ids of a kind.
 
     Args:
-        task: any task.
         seed: of the observations.
     """
     x = task.observations

@@ -46,7 +46,6 @@ class Layout:
     """The nodes of a tree that are drawn, and their places.
 
     Args:
-        graph: the tree.
         x: of every node drawn, in (0, 1); top to bottom, then left to right.
         level: decisions taken at every node drawn.
     """
@@ -123,7 +122,6 @@ def lay_out(graph: CTGraph, ends: Iterable[int], most_leaves: int = MOST_LEAVES)
     """Place the whole tree, or the paths to some nodes if it has more than ``most_leaves`` end states.
 
     Args:
-        graph: the tree.
         ends: nodes, at least one.
         most_leaves: end states up to which all are drawn.
     """
@@ -155,7 +153,6 @@ def shown_ids(task: Task, state: Key, level: int) -> tuple[int, int]:
     """Return the first and last id that a state may show.
 
     Args:
-        task: any task.
         state: a state of its graph.
         level: the decisions taken before it.
     """

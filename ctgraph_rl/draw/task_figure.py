@@ -74,7 +74,6 @@ def draw_task(
 
     Args:
         axes: matplotlib axes, at their final size.
-        task: any task.
         visits: how often each state was visited, from `ctgraph_rl.play.visits.visits`: numbers in the nodes instead of
             ids, and the width of edges.
         policy: b + 1 action probabilities of each state, or its greedy action: numbers at edges; the likeliest action

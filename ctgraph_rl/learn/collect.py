@@ -120,7 +120,6 @@ def collect(
         env: where to act.
         policy: writes ``action`` and, if recurrent, its state under ``("next", key)``.
         num_frames: a multiple of the rows.
-        num_steps: steps in a batch.
         initial_state: gives the rows' first recurrent state.
         between_steps: called before every step with the frames so far; after a batch, once it was used.
 

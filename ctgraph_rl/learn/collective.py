@@ -83,7 +83,6 @@ class Member:
     """A learner of a collective.
 
     Args:
-        curriculum: what it learns.
         agent: the learner; shared with no other member.
         seed: of its environment.
         log: where its measurements are appended.
@@ -115,7 +114,6 @@ def learn_collective(
     answers, and takes over nothing.
 
     Args:
-        members: the learners.
         exchange: what messages they send, and when.
         seed: decides which messages are lost or late.
         log: of the collective: lines ``exchange`` for messages and ``help`` for what members took over. The members'

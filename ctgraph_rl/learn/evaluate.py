@@ -52,14 +52,12 @@ def evaluate(
     Args:
         policy: what plays. A class such as `ctgraph_rl.policies.OptimalPolicy` is built on the environment; a plain
             module maps observations to logits, see `LogitsPolicy`.
-        tasks: what is played.
         num_episodes: episodes per task.
         seed: of the environment and, if not greedy, of the policy's draws.
         greedy: take the most likely actions; False samples and explores as in training.
         episodes_per_row: successive episodes of a row, a divisor of ``num_episodes``. Goals that change between
             episodes need more than one.
         initial_state: gives a recurrent policy's state for a number of environments.
-        device: of the environment.
         curriculum: whose task ids the policy sees, if its protocol shows them.
 
     Returns:
@@ -160,7 +158,6 @@ def adaptation(rows: TensorDictBase, task: TaskLike) -> Iterator[NamedValues]:
 
     Args:
         rows: data of the last step of each episode, [rows, episodes of a row].
-        task: what is played.
     """
     num_rows, num_steps = rows.shape
     exact = found = torch.full([num_steps], math.nan, dtype=torch.float64, device="cpu")
@@ -185,7 +182,6 @@ class Evaluator:
     Args:
         curriculum: says when and how.
         seed: of the run; each evaluation derives one.
-        log: where measurements are appended.
         device: of the environments.
     """
 

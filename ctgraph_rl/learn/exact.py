@@ -119,8 +119,6 @@ def exact_rules(policy: object, task: TaskLike, start: Step) -> Iterator[Rule]:
     """Yield what exact measures require of a policy and a task.
 
     Args:
-        policy: what plays.
-        task: what is played.
         start: the recurrent state before an episode, of one row; empty without memory.
     """
     episodes = "set evaluation.exact=false, which plays episodes"
@@ -205,7 +203,6 @@ class _Shown:
     """What a policy reads of a task.
 
     Args:
-        task: what is played.
         shape: of observations, to which images are padded.
         task_id: one-hot, or None.
     """

@@ -31,7 +31,6 @@ class Guide:
     episode.
 
     Args:
-        policy: of the agent.
         env: where it acts.
         guide_frames: frames over which the share falls from 1 to 0.
     """

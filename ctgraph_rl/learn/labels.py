@@ -62,9 +62,6 @@ def task_policies(
     An agent that labels tasks has ``policy_for_label``, which gets the task's most frequent label.
 
     Args:
-        agent: what learns.
-        curriculum: what it learns.
-        log: of the run so far.
         tasks: what is played. An untrained one has no id and no label, and is played with `Agent.policy`.
         frames: of the run so far, while it lasts. If the present task started after the log's last interval, it has the
             label that acts.

@@ -38,12 +38,9 @@ def learn_curriculum(
     announced boundaries only.
 
     Args:
-        curriculum: what to learn.
-        agent: the learner.
         seed: of the environment, in [0, 2**63).
         log: where measurements are appended; default: a new one in memory.
         progress: updated after every batch; True: a bar on a terminal and in a notebook, lines elsewhere.
-        device: of the environment.
         saved: a state that ``checkpoint`` was given, to resume with the same bits. The agent is built the same way, and
             the log holds what it held then.
         checkpoint: is offered the state after every batch.

@@ -156,11 +156,8 @@ class Lockstep:
     A member with a loss or weight that is not finite has failed and measures nothing from then on.
 
     Args:
-        curriculum: what is learned.
-        group: the learners.
         seeds: of each.
         logs: where each appends its measurements.
-        device: of the environment.
         saved: what `state` returned, to resume from; None: the beginning.
 
     Raises:

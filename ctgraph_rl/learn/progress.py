@@ -87,8 +87,6 @@ class ProgressBar(TextBar):
     """A context manager that shows block, frames, rate, return and time left.
 
     Args:
-        num_blocks: blocks of the run.
-        num_frames: frames of the run.
         console: where it shows; default: standard error.
         done: frames learned before the run was resumed.
     """

@@ -86,7 +86,6 @@ def check_adaptation(curriculum: Curriculum, agent: Agent) -> None:
     """Refuse an agent that adapts where it has nothing to adapt to, or too few episodes or steps.
 
     Args:
-        curriculum: what is learned.
         agent: with ``adapt_episodes`` it adapts to a row's task after so many of its episodes. With
             ``needs_whole_trials`` it learns nothing from trials of ``trial_episodes`` that a batch cuts.
     """

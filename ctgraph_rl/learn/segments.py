@@ -128,7 +128,6 @@ def log_training(
 
     Args:
         log: where lines are appended.
-        curriculum: what is learned.
         batch: [rows, steps].
         start: frames before it.
         measurements: of the batch.

@@ -28,8 +28,6 @@ class Selection(NamedTuple):
     """A task, and the policy that acts in it.
 
     Args:
-        task: the task.
-        name: for readers.
         policy: as for `evaluate`, or None.
         initial_state: of a recurrent policy.
         curriculum: that a trained policy learned.

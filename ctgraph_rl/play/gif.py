@@ -19,8 +19,6 @@ def save_gif(player: Player, path: Path | str, seconds: float = 0.6, size: int =
     """Let a policy play one episode and write its pictures.
 
     Args:
-        player: a task and the policy that acts.
-        path: the file to write.
         seconds: of a picture.
         size: height in pixels, at least 48.
         most_frames: pictures after which the film ends.

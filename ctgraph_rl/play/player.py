@@ -16,7 +16,6 @@ class Player:
     """Plays a task in a separate environment; a policy draws from torch's global generator.
 
     Args:
-        task: what is played.
         policy: acts where no action is given, as for `evaluate`; None: an action must be given.
         initial_state: gives a recurrent policy's state for a number of rows.
         seed: of the environment.

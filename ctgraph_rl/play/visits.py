@@ -42,7 +42,6 @@ def visits(
     """Count visits and actions of a policy; ``draw_task(axes, task, visits=counts, policy=actions)`` draws them.
 
     Args:
-        task: what is played.
         policy: as for `evaluate`.
         initial_state: gives a recurrent policy's state for a number of rows.
         num_episodes: episodes in all.

@@ -63,9 +63,7 @@ def known_bits(folder: Path, agent_class: Any, task: Task) -> KnownBits:
     """Return what the trained agent of a run knows.
 
     Args:
-        folder: of the run.
         agent_class: of its agent, if known.
-        task: what it learned.
 
     Raises:
         Undefined: if it has no ``predict_next``, cannot be loaded, or gives no probabilities.
@@ -171,7 +169,6 @@ def _place(task: Task, seen: Tensor, action: Tensor) -> Tensor:
     """Return the row of `_tables` of each row's last step, int64 [rows].
 
     Args:
-        task: the task.
         seen: numbers of images, [rows, steps].
         action: [rows, steps].
     """

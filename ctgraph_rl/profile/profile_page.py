@@ -29,7 +29,6 @@ def write_profile(paths: Sequence[Path | str], folder: Path | str, agents: Seque
 
     Args:
         paths: folders of runs.
-        folder: where the page goes.
         agents: names and order of agents.
 
     Raises:

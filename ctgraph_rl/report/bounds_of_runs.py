@@ -97,7 +97,6 @@ def bounds_of_curriculum(curriculum: Curriculum, evaluations: int = 1) -> Bounds
     optimum, do not count.
 
     Args:
-        curriculum: what they learn.
         evaluations: of each task, after those before training; needed for sums over time.
     """
     evaluation = curriculum.evaluation

@@ -69,7 +69,6 @@ def displayed(runs: Sequence[Run], agents: Sequence[str] = ()) -> list[Run]:
     """Return runs with other names of agents and in another order; agents that are not named follow.
 
     Args:
-        runs: any runs.
         agents: in order, each as its name in tables, or as ``NAME=SHOWN``.
 
     Raises:

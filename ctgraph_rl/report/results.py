@@ -67,7 +67,6 @@ class Row:
     """A line of the table.
 
     Args:
-        curriculum: its name.
         agent: its class or name, with the settings that distinguish it; or a directory.
         measure: a metric, a measure of how tasks ended, or ``solved`` and a task.
         estimate: over seeds.
@@ -167,7 +166,6 @@ def selected(rows: Sequence[Row], names: Sequence[str] | None = None, also: Sequ
     """Return the rows of some measures; agents without a finished run stay.
 
     Args:
-        rows: the whole table.
         names: of measures, ``solved`` for all tasks' shares; None: the curriculum's, the solved rate, and those of
             `WHERE_KNOWN` with a value.
         also: further measures.

@@ -47,8 +47,6 @@ class Result:
     """The runs of an agent on a curriculum.
 
     Args:
-        agent: its name.
-        by_seed: its runs.
         bounds: of what they measure.
     """
 
@@ -100,8 +98,6 @@ class Section:
 
     Args:
         name: the curriculum's, unique among sections.
-        results: an agent each.
-        rows: the table of measures.
         modified: what differs from the published curriculum, if anything.
     """
 

@@ -205,8 +205,6 @@ def iqm(values: Sequence[Values], level: float = LEVEL, resamples: int = RESAMPL
     Args:
         values: for each task, one value per seed; None or NaN for a seed without.
         level: coverage of the interval.
-        resamples: bootstrap samples.
-        seed: of the bootstrap.
     """
     stats = scipy("stats")
     known, n, undefined = _of_tasks(values, "iqm", level, resamples)
@@ -302,8 +300,6 @@ def interquartile_mean(
     Args:
         values: for each task, one value per seed; None or NaN for a seed without.
         level: coverage of the interval.
-        resamples: bootstrap samples.
-        seed: of the bootstrap.
         bounds: the lowest and highest possible value.
     """
     known, n, undefined = _of_tasks(values, "interquartile_mean", level, resamples)

@@ -35,7 +35,6 @@ class SelfLabelled:
 
     Args:
         method: any lifelong-learning method that learns the curriculum unchanged.
-        detector: gives the labels.
     """
 
     def __init__(self, method: MethodLike, detector: Judge) -> None:
@@ -90,7 +89,6 @@ class SelfLabelled:
         """Return the agent with the method, whose tasks the detector labels.
 
         Args:
-            agent: a new agent.
             curriculum: from `prepare`.
 
         Raises:
@@ -138,9 +136,7 @@ class SelfLabelledAgent(nn.Module):
 
     Args:
         learner: the agent with its method.
-        detector: gives the labels.
         policy: of the agent, which computes features.
-        max_labels: most labels.
     """
 
     events = ("alarm", "rolled_back")

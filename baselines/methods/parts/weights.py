@@ -101,7 +101,6 @@ def head_names(policy: TensorDictModuleBase, without: str | None = None) -> list
     """Return the names of the parameters of a policy's output layers, the last linear layers behind the trunk.
 
     Args:
-        policy: the policy.
         without: a key; leave out the modules that write it.
     """
     names = []

@@ -45,7 +45,6 @@ def write_board(
 
     Args:
         paths: folders of submissions, or folders that hold them.
-        folder: where the files go.
         config_dir: where the user's tracks are, as ``track/NAME.yaml``.
 
     Raises:

@@ -57,9 +57,7 @@ class BoardTable:
     """Comparable entries, the best score first.
 
     Args:
-        track: of all entries.
         variant: what all learned.
-        standings: the lines.
         pairs: comparisons of the scores of every two ranked entries, by name.
     """
 

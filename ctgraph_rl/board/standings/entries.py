@@ -59,11 +59,9 @@ class BoardEntry:
         track: that it is for.
         variant: what it learned.
         verification: how far it was verified.
-        seeds: of the track.
         values: of the track's score and `board_columns`, one for each seed, or None.
         failed: why seeds failed.
         agent_bytes: of the largest agent, if a run left one.
-        folder: of the submission.
     """
 
     digest: str

@@ -58,7 +58,6 @@ def performance_profile(of_tasks: Scores, thresholds: np.ndarray, seed: int = 0)
     Args:
         of_tasks: an agent's scores.
         thresholds: float64 [thresholds].
-        seed: of the bootstrap.
     """
     rng = np.random.default_rng(seed)
     drawn = np.concatenate([_drawn(values, rng) for values in of_tasks.values()], axis=1)
@@ -80,7 +79,6 @@ def probability_of_improvement(first: Scores, second: Scores, seed: int = 0) -> 
     Args:
         first: scores of the agent that may be better.
         second: scores of the other.
-        seed: of the bootstrap.
     """
     rng = np.random.default_rng(seed)
     tasks = [task for task in first if task in second]

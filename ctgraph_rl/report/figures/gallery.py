@@ -44,7 +44,6 @@ class Gallery:
     """Writes figures into a report's folder, with unique names.
 
     Args:
-        folder: of the report.
         width: as for `style`.
         colours: as for `style`.
         count: takes how many figures are done.
