@@ -72,8 +72,8 @@ class DQN(QLearner):
         alpha = self.settings.priority_alpha
         return PrioritySampler(size, alpha, self.settings.priority_beta) if alpha else super().make_sampler(size)
 
+    @override
     def experience(self, batch: TensorDictBase) -> TensorDictBase:
-        """Return every step as a transition of up to ``n_steps`` steps."""
         seen = self.policy.in_keys
         after = [("next", key) for key in (*seen, "reward", "done", "terminated")]
         return batch.select(*seen, "action", *after, "steps_to_next_obs").reshape(-1)

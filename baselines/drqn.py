@@ -6,6 +6,7 @@ Hausknecht and Stone 2015 (arXiv 1507.06527), with stored states and double targ
 from __future__ import annotations
 
 from torch import Tensor
+from typing_extensions import override
 
 from baselines.parts.recurrent_q import RecurrentQ
 
@@ -15,6 +16,6 @@ class DRQN(RecurrentQ):
 
     solves = "partially observable tasks too, if episodes are short enough to remember"
 
+    @override
     def distance(self, predicted: Tensor, target: Tensor) -> Tensor:
-        """Return the squared error of the value."""
         return (predicted - target).square().squeeze(-1)

@@ -169,8 +169,8 @@ class ModulatedGreedy(TensorDictModuleBase):
         self.in_keys = [*trunk.in_keys, "is_init", *STATE]
         self.out_keys = ["action", *(("next", key) for key in STATE)]
 
+    @override
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action`` and the next state."""
         features = self.features(tensordict)
         average = tensordict["average"]
         noisy = features
@@ -272,8 +272,8 @@ class MOHQA(QLearner):
         steps = torch.ones(batch.shape, dtype=torch.int64, device=batch.device)
         return batch.clone(False).set("steps_to_next_obs", steps)
 
+    @override
     def experience(self, batch: TensorDictBase) -> TensorDictBase:
-        """Return every step as a transition of up to ``n_steps`` steps."""
         seen = (*self.policy.greedy.in_keys, "average")
         after = [("next", key) for key in (*seen, "reward", "terminated")]
         return batch.select(*seen, "action", *after, "steps_to_next_obs").reshape(-1)

@@ -109,8 +109,8 @@ class PosteriorPolicy(TensorDictModuleBase):
         precision = 1 / softplus(raw).clamp(min=SMALLEST_VARIANCE)
         return precision, precision * mean
 
+    @override
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action`` and the next state."""
         begins = tensordict["is_init"]
         episode = tensordict["trial"] + begins
         fresh = begins & ((episode == 1) | (episode > self.trial_episodes))
@@ -216,8 +216,8 @@ class PEARL(Learner):
         self.replay: Items = {}
         """The last steps of all rows, [rows, steps] each, and whether a trial ``begins`` there."""
 
+    @override
     def initial_state(self, num_envs: int) -> TensorDict:
-        """Return the state before the first trial, which lasts over episodes by its key ``trial``."""
         like = next(self.parameters()).detach()
         counts = like.new_zeros(num_envs, dtype=torch.int64)
         state = {"trial": counts.unsqueeze(-1), ACTION: counts, "reward": like.new_zeros(num_envs, 1)}
@@ -268,8 +268,8 @@ class PEARL(Learner):
     def other_weights(self) -> TensorsByName:
         return {f"critics.{name}": value for name, value in self.targets.named_parameters()}
 
+    @override
     def loss(self, batch: Data, others: Data | None = None) -> TensorsByName:
-        """Return the losses of a minibatch."""
         mean, variance = self.posterior(batch)
         context = (mean + variance.sqrt() * batch["noise"]).unsqueeze(1).expand(-1, batch["action"].shape[1], -1)
         fixed = context.detach()

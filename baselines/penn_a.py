@@ -450,8 +450,8 @@ class PennA(TensorDictModuleBase):
         self.population = Population(*map(fn, self.population))
         return super()._apply(fn, recurse)
 
+    @override
     def get_extra_state(self) -> NamedValues:
-        """Return the population, its age and the optimiser's state."""
         state = {"population": self.population._asdict(), "generation": self.generation, "lived": self.lived}
         state["optimiser"] = self.optimiser.state_dict()
         return state

@@ -209,8 +209,8 @@ class AMD(Detector):
         degrees = pairs * (self.num_observations - (self.degrees == "corrected"))
         return chi_squared_tail(statistic(observed, expected), degrees)
 
+    @override
     def state_dict(self) -> NamedValues:
-        """Return the models, and what verdicts depend on beside them."""
         models = {label: (model.keys, model.counts) for label, model in self.models.items()}
         return {**super().state_dict(), "models": models}
 

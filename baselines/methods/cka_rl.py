@@ -107,8 +107,8 @@ class CKARL(TaskMethod):
         return own + self.shares @ self.pool[: self.num_combined] if self.num_combined else own
 
     @torch.no_grad()
+    @override
     def start_task(self, task: int | None) -> None:
-        """Start a task at w_base and a mixture, or load the weights of one that returns."""
         super().start_task(task)
         if self.slot < self.ended:
             write_flat(self.kept[self.slot], list(self.own))
@@ -123,8 +123,8 @@ class CKARL(TaskMethod):
         self.agent.weights_changed()
 
     @torch.no_grad()
+    @override
     def end_task(self) -> None:
-        """Store the task's weights, and add its vector to the pool."""
         present = self.current()
         if self.slot >= self.ended:
             if self.slot:
@@ -135,8 +135,8 @@ class CKARL(TaskMethod):
         write_flat(present, list(self.own))
         self.ended = max(self.ended, self.slot + 1)
 
+    @override
     def transform_gradients(self, gradients: Sequence[Tensor], weights: Sequence[Tensor]) -> Sequence[Tensor]:
-        """Return the gradients of the weights, and that of alpha."""
         in_scope = flat(self._within(gradients))
         shares = self.shares.detach()
         along = self.pool[: self.num_combined] @ in_scope
@@ -149,8 +149,8 @@ class CKARL(TaskMethod):
         write_flat(self.current(), self._within(weights))
 
     @torch.no_grad()
+    @override
     def task_weights(self, task: int) -> Tensor | None:
-        """Return a task's weights in scope, and the present ones elsewhere."""
         return self.present_with(task, self.in_scope, self.kept)
 
     def _within(self, tensors: Sequence[Tensor]) -> list[Tensor]:

@@ -102,8 +102,8 @@ class CLEAR(Method):
         self.reservoir = Reservoir(self.buffer_size // steps)
 
     @torch.no_grad()
+    @override
     def on_batch(self, batch: TensorDictBase) -> None:
-        """Offer a batch's steps, or with memory its rows, to the reservoir."""
         agent = self.agent
         if agent.memory and batch.shape[1] != agent.num_steps:
             return
@@ -117,8 +117,8 @@ class CLEAR(Method):
             items = {key: value.flatten(0, 1) for key, value in items.items()}
         self.reservoir.offer(items)
 
+    @override
     def transform_minibatch(self, batch: Data) -> Data:
-        """Add as many replayed items to the minibatch, once there are any."""
         if not len(self.reservoir):
             return batch
         replayed = self.reservoir.sample(len(batch["action"]))

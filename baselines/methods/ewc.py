@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from baselines.methods.parts.importance import SampledImportance, learnt_steps, num_learnt
 from baselines.methods.parts.weights import flat
@@ -50,12 +51,12 @@ class EWC(SampledImportance):
         if fisher == "policy":
             self.agent_members += ("outputs",)
 
+    @override
     def task_importance(self) -> Tensor:
-        """Return the diagonal of the Fisher information."""
         return self.mean(self._of_policy) if self.fisher == "policy" else self._of_losses()
 
+    @override
     def consolidate(self, new: Tensor, weights: Tensor) -> None:
-        """Update the running mean, or add the task's term."""
         if not self.online:
             total = self.importance + new
             moved = torch.where(total > 0, (self.importance * self.anchor + new * weights) / total, weights)

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from baselines.methods.parts.importance import SampledImportance, learnt_steps
 from baselines.parts.networks import Data
@@ -24,8 +25,8 @@ class MAS(SampledImportance):
     stackable = True
     agent_members = (*SampledImportance.agent_members, "outputs", "output_keys")
 
+    @override
     def task_importance(self) -> Tensor:
-        """Return the mean sensitivity of the outputs' squared norm."""
         return self.mean(self._sensitivity)
 
     def _sensitivity(self, item: Data) -> Iterator[Tensor]:

@@ -121,8 +121,8 @@ class MaskAMSC(SelectedMasks):
         )
         return played["episode_reward"].mean().item()
 
+    @override
     def choose(self) -> list[int]:
-        """Return the support of the sparsemax, or as many others."""
         known = self.embeddings.of_slot
         earlier = [slot for slot in range(self.num_combined) if slot in known]
         if self.slot not in known or not earlier:
@@ -139,8 +139,8 @@ class MaskAMSC(SelectedMasks):
             support = candidates[order[: len(support)]]
         return support.tolist()
 
+    @override
     def get_extra_state(self) -> NamedValues:
-        """Return competences, returns and the state of the shuffling stream."""
         own = {"competence": dict(self.competence), "returns": list(self.returns), "shuffle": self.shuffle.get_state()}
         return {**super().get_extra_state(), **own}
 

@@ -66,8 +66,8 @@ class MaskSC(SelectedMasks):
         if self.num_combined and self.selection in ORACLES:
             self.select(self.choose())
 
+    @override
     def choose(self) -> list[int]:
-        """Return the slots that the selection names."""
         earlier = list(range(self.num_combined))
         if self.selection == "similarity":
             return self._similar()

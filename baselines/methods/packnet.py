@@ -69,8 +69,8 @@ class PackNet(TaskMethod):
         self.in_heads = weights.in_heads
 
     @torch.no_grad()
+    @override
     def start_task(self, task: int | None) -> None:
-        """Let free weights change; in a returning task, only its output layers."""
         new = task not in self.started
         super().start_task(task)
         self.heads.start_task(task)
@@ -84,8 +84,8 @@ class PackNet(TaskMethod):
         self.agent.clear_optimiser_state(self.weights.parameters)
 
     @torch.no_grad()
+    @override
     def end_task(self) -> None:
-        """Prune if that was not done yet, and fix the task's weights."""
         self._prune()
         self.packed.copy_(torch.where(self.owner == self.slot, self.weights.vector(), self.packed))
         self.heads.end_task()
@@ -97,20 +97,20 @@ class PackNet(TaskMethod):
             self._prune()
         self.frames += batch.numel()
 
+    @override
     def transform_gradients(self, gradients: Sequence[Tensor], weights: Sequence[Tensor]) -> Sequence[Tensor]:
-        """Return the gradients of weights that may change, and 0 for the others."""
         live = self.weights.split(self.live)
         return [gradient * part.view_as(gradient) for gradient, part in zip(gradients, live, strict=True)]
 
     @torch.no_grad()
+    @override
     def after_step(self, weights: Sequence[Tensor]) -> None:
-        """Undo the optimiser's changes of fixed weights."""
         fixed = torch.where(self.mine, self.packed, 0.0)
         write_flat(torch.where(self.live, flat(weights), fixed), weights)
 
     @torch.no_grad()
+    @override
     def task_weights(self, task: int) -> Tensor | None:
-        """Return the weights of the tasks up to this one, with its output layers."""
         slot = self.other_slot(task)
         if slot is None:
             return None

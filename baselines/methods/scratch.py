@@ -33,8 +33,8 @@ class Scratch(TaskMethod):
         require((not fixed, f"Scratch draws weights again by reset_parameters, which {', '.join(fixed)} lack: add it"))
         self.register_buffer("kept", weights.zeros().repeat(self.num_tasks, 1))
 
+    @override
     def start_task(self, task: int | None) -> None:
-        """Load the task's network; the first task takes the new agent's."""
         first = not self.started
         known = task in self.started
         super().start_task(task)

@@ -72,6 +72,6 @@ class SI(Importance):
     def after_step(self, weights: Sequence[Tensor]) -> None:
         self.path -= self.slope * (flat(weights) - self.before)
 
+    @override
     def task_importance(self) -> Tensor:
-        """Return the fall of the loss along the path, by the squared changes of the weights."""
         return self.path.clamp(min=0) / ((self.weights.vector().detach() - self.start).square() + self.epsilon)

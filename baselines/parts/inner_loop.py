@@ -208,8 +208,8 @@ class InnerPolicy(TensorDictModuleBase):
         self.in_keys = [*seen_keys, "is_init", "reward", *state]
         self.out_keys = ["action", *(("next", key) for key in state)]
 
+    @override
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action`` and the next state."""
         theta = {name: value.detach() for name, value in self.model.theta.items()}
         begins = tensordict["is_init"].squeeze(-1)
         episode = tensordict["trial"].squeeze(-1) + begins
@@ -349,8 +349,8 @@ class InnerLoop(Learner):
         """The weights, and how they adapt."""
         return self.policy.model
 
+    @override
     def initial_state(self, num_envs: int) -> TensorDict:
-        """Return the state before the first trial, which lasts over episodes by its key ``trial``."""
         theta = self.model.theta
         like = next(iter(theta.values())).detach()
         state = {

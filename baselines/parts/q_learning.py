@@ -86,8 +86,8 @@ class Exploration(EGreedyModule):
 class EpsilonGreedy(TensorDictSequential):
     """A `QValueActor` of trunk, head and exploration, which computes TorchRL's results in plain tensors."""
 
+    @override
     def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
-        """Write ``action`` and the trunk's next state."""
         exploration, *others = self.module[1:]
         values, written = self._act(tensordict)
         written["action"] = values.argmax(dim=-1)
@@ -286,8 +286,8 @@ class QLearner(Learner):
         """Whether the target network is due after the next gradient step."""
         return self.prioritized or self.target_age == self.settings.target_update_interval - 1
 
+    @override
     def get_extra_state(self) -> NamedValues:
-        """Return the optimiser's state, the replay buffer and the target network's age in gradient steps."""
         replay = self.replay.state_dict()
         for items in replay["_storage"]["_storage"].values():
             if isinstance(items, Tensor):  # unused places hold anything; equal agents have equal states

@@ -190,13 +190,13 @@ class SampledImportance(Importance):
     def on_batch(self, batch: TensorDictBase) -> None:
         self.samples.remaining = self.agent.num_learnt(batch)
 
+    @override
     def transform_minibatch(self, batch: Data) -> Data:
-        """Keep the minibatch for the end of the task."""
         self.samples.add(batch)
         return batch
 
+    @override
     def end_task(self) -> None:
-        """Set the importances for the task, and drop its samples."""
         super().end_task()
         self.samples.clear()
 

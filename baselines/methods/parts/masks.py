@@ -90,8 +90,8 @@ class Masks(TaskMethod):
         return list(self.own)
 
     @torch.no_grad()
+    @override
     def start_task(self, task: int | None) -> None:
-        """Initialise a new task's scores, or load those of a returning task."""
         super().start_task(task)
         if self.slot < self.ended:
             self.set_scores(self.weights.split(self.scores[self.slot]))
@@ -131,8 +131,8 @@ class Masks(TaskMethod):
         self.set_scores(present)
         self.ended = max(self.ended, self.slot + 1)
 
+    @override
     def transform_gradients(self, gradients: Sequence[Tensor], weights: Sequence[Tensor]) -> Sequence[Tensor]:
-        """Return the gradients of the trained parameters, through the scores."""
         with torch.enable_grad():
             scores = self.current_scores()
         constants = self.weights.split(self.constant)

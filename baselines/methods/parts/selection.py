@@ -212,8 +212,8 @@ class SelectedMasks(MaskLC):
         self.community = self.scores[filled]
         self.set_places([*filled, self.slot], len(filled) - len(slots), self.scores.device)
 
+    @override
     def get_extra_state(self) -> NamedValues:
-        """Return the selection and all that it depends on."""
         counts = {"selected": self.selected, "num_batches": self.num_batches, "random": self.generator.get_state()}
         return {**super().get_extra_state(), **counts, "embeddings": self.embeddings.state()}
 
