@@ -40,7 +40,6 @@ from baselines.update.update import make_optimiser, minimise
 from ctgraph_rl.checks import NamedValues, at_least_one, fraction, not_negative, positive, require, require_memory
 
 LARGEST_INPUT = 5.0
-"""Standard deviations to which observations are limited."""
 
 
 class Moments(nn.Module):

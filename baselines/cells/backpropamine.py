@@ -14,8 +14,8 @@ where eta without an index is one learned number, and row i, column j of Hebb be
 unit j. W and A start in [0, 0.001). The paper also feeds the last action and reward, which are settings here, and the
 time.
 
-Fast weights take 4 H^2 bytes an environment, twice that if retroactive. A batch holds them once, a gradient's
-computation for each step.
+Fast weights take 4 H^2 bytes an environment, twice that if retroactive, and while a gradient is computed as much for
+each step.
 """
 
 from __future__ import annotations

@@ -101,7 +101,6 @@ class AMD(Detector):
         self.num_untested = num_untested
         self.label = 0
         self.is_doubted = False
-        """Whether the label did not fit the last batch."""
 
     @override
     def setup(self, num_rows: int, num_steps: int, num_actions: int, num_observations: int | None) -> None:
@@ -115,13 +114,11 @@ class AMD(Detector):
         require((self.order <= longest, f"{rule}, got {self.order}"))
         integers = partial(torch.zeros, dtype=torch.int64, device="cpu")
         self.models: dict[int, Counts] = {0: Counts()}
-        """Of each label."""
 
         self.recent = integers(num_rows, self.order - 1)
         """The last pairs of action and next observation of each row's episode, from 1; 0: none."""
 
         self.last_action = integers(num_rows)
-        """Of each row."""
 
         self.pending = integers(0, 3)
         """History, action and next observation of the steps after the last window."""

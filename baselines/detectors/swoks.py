@@ -109,7 +109,6 @@ class SWOKS(Detector):
         """In windows since the label was started."""
 
         self.pending = torch.zeros(0, dtype=torch.float32, device="cpu")
-        """The points behind the last window."""
 
         self.history: list[Tensor] = []
         """The present label's last windows, oldest first, float32 [window, n] each; none in a trial."""

@@ -71,7 +71,6 @@ class MaskExchange(Exchange):
     """
 
     method = "mask_ri"
-    """The method that members need."""
 
     def connect(self, agents: Sequence[Agent]) -> None:
         """Take the members' methods.

@@ -25,7 +25,6 @@ DISTANCES = ("cosine", "l2")
 EPISODES = ("training", "evaluation", "none")
 
 SMALLEST_DEVIATION = 1e-3
-"""Least divisor of similarities."""
 
 
 class MaskAMSC(SelectedMasks):

@@ -163,7 +163,6 @@ class TaskMethod(Method):
         """The ids of started tasks, in the order of their slots."""
 
         self.slot = 0
-        """The present task's."""
 
     @override
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:

@@ -15,7 +15,6 @@ WIDTH = 64
 """Of the embedding and the GRU."""
 
 NUM_EPOCHS = 40
-"""Passes over the data of a call of `GRUModel.learn`."""
 
 
 class GRUModel:

@@ -12,13 +12,11 @@ deviation 1 over the steps before the adaptation, or over those after it. R is t
 linear function of observation and time (Duan et al. 2016, arXiv 1604.06778), fitted to the episodes before the
 adaptation.
 
-The episodes before the adaptation get no credit for what they reveal. So the policy may drift until it always goes to
-one goal and has nothing to adapt to. PPO counters this with ``entropy_coeff``: it also maximises the entropy of the
-policy before the adaptation, with the weights of L.
+The episodes before the adaptation get no credit, so the policy may drift until it always goes to one goal. PPO counters
+this with ``entropy_coeff``, the weight of the policy's entropy before the adaptation.
 
-TRPO bounds the divergence of adapted policies on the played episodes, not that of the policy before the adaptation.
-Once all episodes after it succeed, A is only what b misses, yet a step is as long as ``max_kl`` allows: the next
-adapted returns can fall. Both are as published.
+TRPO bounds the divergence of adapted policies on the played episodes only. Once all episodes after the adaptation
+succeed, A is what b misses, yet steps are as long as ``max_kl`` allows, so returns can fall. Both are as published.
 
 `torch.func.vmap` runs over all trials as one batch. As weights change between batches, only trials that begin and end
 within one batch count.

@@ -29,7 +29,6 @@ from ctgraph_rl.agent import Agent
 from ctgraph_rl.learn.loop import Learnt
 
 HOOKS = ("on_batch", "transform_minibatch", "penalties", "transform_gradients", "after_step", "after_learning")
-"""Hooks of a method at a batch, for which the class that sets ``stackable`` vouches."""
 
 LARGEST_MINIBATCH = 512
 """Items of the largest stacked minibatches; larger ones keep a core busy by themselves."""

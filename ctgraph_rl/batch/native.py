@@ -329,7 +329,6 @@ _ARRAYS = {
 _READ = [name for name, (*_, is_read) in _ARRAYS.items() if is_read]
 _WRITTEN = [name for name in _ARRAYS if name not in _READ]
 _OF_ROWS = ("mask", "shown")
-"""Arrays of [N, ...]."""
 _StatePointers = ctypes.c_void_p * len(RowState._fields)
 
 

@@ -387,7 +387,6 @@ class Rows(TakesNumbers, nn.Module):
 
 
 _ASSIGNED = ("task", "choice", "episodes")
-"""The fields of `Assignment` that are buffers."""
 
 
 def seed_rule(seed: object) -> Rule:

@@ -1,11 +1,11 @@
 """The code of others in bubblewrap, within limits of time, memory, disk and processes.
 
 https://github.com/containers/bubblewrap, 0.8 or newer. Inside are Python and the system's programs, read-only, and one
-folder to write to; no network, other process, capability, terminal or open file. libseccomp filters the system calls
-that name spaces leave open. Without these nothing runs.
+writable folder; no network, other process, capability, terminal or open file. libseccomp filters system calls. Without
+these nothing runs.
 
-A cgroup limits the memory of all processes together, made here or by systemd; else a number of threads with a share of
-the memory each. Where neither works, nothing runs.
+A cgroup, made here or by systemd, limits the memory of all processes together, else a number of threads with a share
+each. Where neither works, nothing runs.
 """
 
 from __future__ import annotations
@@ -46,7 +46,6 @@ PACKAGES = ("ctgraph_rl", "baselines", "conf", "curricula", "hydra_plugins")
 """Folders of our packages, side by side."""
 
 GRAPHICS = ("nvidia*", "kfd", "dri")
-"""Devices of graphics cards, in ``/dev``."""
 
 OWN = {"/tmp": "tmp", "/dev/shm": "shm"}
 """Folders to write to, and their places in the folder of the process, with which they are counted."""

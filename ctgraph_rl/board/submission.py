@@ -39,7 +39,6 @@ LOGS = "logs"
 VERIFICATION = "verification.json"
 
 SCHEMA = 2
-"""Of ``submission.json``."""
 
 MOST_BYTES, MOST_BYTES_OF_A_LOG = 2**24, 2**26
 """Largest ``submission.json``, 16 MiB, and largest log, packed and unpacked, 64 MiB."""

@@ -44,7 +44,6 @@ NONE = "none"
 """The level of a submission that fails the first."""
 
 SCHEMA = 1
-"""Of ``verification.json``."""
 
 LEAST_SECONDS = 600
 """Least time limit of a process."""

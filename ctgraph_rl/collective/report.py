@@ -29,7 +29,6 @@ SHOWN = (
     *("curriculum", "agent", "method", "exchange", "num_members", "seed"),
     *("learning_time", "share_learned", "final_return", "sent", "dropped", "delayed", "bytes", "helps"),
 )
-"""Columns of the page's table."""
 
 MEANING = (
     f"learning_time: mean over members and blocks of the frames until {MASTERED} of a batch are at the goal; a block "
@@ -39,7 +38,6 @@ MEANING = (
 )
 
 MOST_MAPS = 12
-"""Most collectives whose map of help is drawn."""
 
 
 def find_collectives(paths: Sequence[Path | str]) -> list[Collective]:

@@ -24,7 +24,6 @@ from ctgraph_rl.metrics.record import HERE, MASTERED, Metric
 from ctgraph_rl.runs.read import split_by
 
 COLLECTIVE = "collective.jsonl"
-"""The log of a collective."""
 
 FILES = (COLLECTIVE, "members.csv", "messages.csv", "helps.csv", METRICS)
 """Files of a collective's directory, in the order of writing."""

@@ -11,7 +11,6 @@ from ctgraph_rl.log.escape import terminal_lines
 from ctgraph_rl.tasks.task import Task
 
 MOST_LEAVES = 1024
-"""End states up to which a file has the whole tree."""
 
 SHAPES: Mapping[StateType, str] = {HOME: "house", WAIT: "circle", DECISION: "diamond", END: "box", FAIL: "octagon"}
 

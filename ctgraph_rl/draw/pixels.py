@@ -64,10 +64,10 @@ def render(
 ) -> Tensor:
     """Draw every row: its observation and its tree with the goal and the current position.
 
-    A star is below the goal, a thick dark line is the way so far, and the current state has a black outline. On failure
-    the outline is around the fail mark, top right, and a cross marks the place: a decision state, also for the wait
-    state before it, or the wait state before an end. A small cross marks swapped branches. Of a tree too wide only the
-    paths to the current node and to the goal are drawn, with stubs for other branches.
+    A star is below the goal, a thick dark line is the way so far, and a black outline the current state. On failure the
+    outline is around the fail mark, top right, and a cross at the decision state, also for the wait state before it, or
+    at the wait state before an end. A small cross marks swapped branches. Trees that are too wide show the paths to the
+    current node and the goal, with stubs.
 
     Args:
         tasks: the rows' tasks, N in all.

@@ -65,9 +65,9 @@ def draw_task(
 ) -> None:
     """Draw a task's graph: each state in the colour and shape of its kind, and a star at the goal.
 
-    Wait states that may last have a loop; dashed arrows are actions that fail. Nodes hold the ids of their
-    observations, the first and the last where one is drawn. Of a tree with more than 32 end states only the paths to
-    the goal and to the most visited end states are drawn.
+    Wait states that may last have a loop; dashed arrows are actions that fail. Nodes hold ids of observations, the
+    first and last where one is drawn. Beyond 32 end states only the paths to the goal and the most visited ones are
+    drawn.
 
     States are keys (state type, node), as in ``env.state_type`` and ``env.node``; home and fail have node 0. States
     missing in a mapping have no overlay.

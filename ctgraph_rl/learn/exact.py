@@ -1,11 +1,10 @@
 """Exact mean return, success rate, end rate and length of a policy on a CT-graph, without episodes.
 
-Without noise on reading, an agent can have seen finitely many things. A policy without memory is a table with a row for
-each image; backward induction gives its values (`ctgraph_rl.tasks.values`). With memory, all histories are played at
-once, each with its probability. They branch only at decisions, at waits and where images are drawn, as an action that
-fails ends an episode.
+Without noise on reading, an agent can have seen finitely many things. A policy without memory is a table by image,
+valued by backward induction (`ctgraph_rl.tasks.values`). With memory, all histories are played at once with their
+probabilities. They branch at decisions, at waits and where images are drawn, as an action that fails ends an episode.
 
-Where waits are drawn (p > 0), stays of a probability below `LEAST_STAY` are left out. This changes a success rate by
+Where waits are drawn (p > 0), stays of a probability below `LEAST_STAY` are left out, which changes a success rate by
 less than (d + 1) times that.
 """
 
@@ -40,7 +39,6 @@ MOST_HISTORIES = 2**22
 """Most histories that are played: 10 s of an LSTM on one core."""
 
 HISTORIES_AT_ONCE = 2**15
-"""Histories of one forward pass."""
 
 ActionProbs = Callable[[Tensor], Tensor]
 """Maps images, uint8 [n, *shape], to action probabilities, float [n, A], or to actions, int64 [n]."""

@@ -38,7 +38,6 @@ TOLERANCE = 1e-3
 
 
 MOST_LETTERS = 300
-"""Of a reason."""
 
 
 class KnownBits(NamedTuple):

@@ -34,10 +34,8 @@ HALVINGS = 20
 
 
 REPLACED = ("curriculum=", "seed=", "overwrite=")
-"""Settings of a run that a command replaces."""
 
 OF_AGENTS = ("policy_for", "initial_state", "learn", "load_state_dict")
-"""Methods that identify a class of agents."""
 
 
 class Score(NamedTuple):

@@ -66,7 +66,6 @@ class BoundsOfRuns:
 
 
 NO_BOUNDS = BoundsOfRuns()
-"""Of unknown runs."""
 
 
 def bounds_by_curriculum(runs: Sequence[Run]) -> dict[str, BoundsOfRuns]:

@@ -32,7 +32,6 @@ HEADING = 12
 """Characters of a heading's line."""
 
 MOST_LINES = 40
-"""Lines of numbers in a table."""
 
 
 class TableCell(NamedTuple):

@@ -44,7 +44,6 @@ MOST_ROWS = 2000
 """Rows up to which the table of every measure is shown."""
 
 MOST_SENTENCES = 10
-"""Seeds without results that are listed."""
 
 MOST_COLUMNS = 10
 """Tasks up to which LaTeX has the performance matrix."""

@@ -31,7 +31,6 @@ LEVEL = 0.95
 LEAST_FOR_BOOTSTRAP = 10
 RESAMPLES = 10_000
 BATCH = 1000
-"""Bootstrap samples in memory at a time."""
 
 MOST_FLIPPED = 16
 """Pairs up to which all flips of signs are tried."""

@@ -27,7 +27,6 @@ MOST_AGENTS = 6
 """Agents of a curriculum that figures show, one for each colour of the style."""
 
 LONGEST_NAME = 22
-"""Characters of a name in a figure."""
 
 
 def require_packages(what: str = "the report", *names: str) -> None:

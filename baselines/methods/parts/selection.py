@@ -142,7 +142,6 @@ class SelectedMasks(MaskLC):
         self.selected: list[int] = []
 
         self.num_batches = 0
-        """Of the present task."""
 
     @override
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:

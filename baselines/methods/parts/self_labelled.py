@@ -158,10 +158,8 @@ class SelfLabelledAgent(nn.Module):
         """The label before the suspicion, while labels are tried."""
 
         self.waiting: list[int] = []
-        """The labels still to be tried."""
 
         self.num_tried = 0
-        """Frames of the present label's trial."""
 
         self.snapshots: list[NamedValues] = []
         """The older one first; each with ``state`` and ``frames``, those learned until the next one."""
@@ -319,4 +317,3 @@ class SelfLabelledAgent(nn.Module):
 
 
 STATE = ("label", "num_labels", "home", "num_tried")
-"""Numbers of a `SelfLabelledAgent` that are saved."""

@@ -18,7 +18,6 @@ from ctgraph_rl.report.latex import Table as LatexTable
 from ctgraph_rl.report.statistics import Estimate
 
 SCHEMA = 1
-"""Of ``board.json``."""
 
 LEGEND = (
     f"{MEANS}; rank: those that comparisons of all pairs leave open, seed by seed, with Holm's correction at 5 %; "

@@ -29,16 +29,13 @@ OF_FILES = {"none": "failed", **{level: level for level in LEVELS[2:]}}
 """Levels by their names in ``verification.json``."""
 
 MOST_BYTES = 2**24
-"""Largest ``verification.json`` that is read."""
 
 FIELDS = (
     *("schema", "level", "bits", "digest", "number", "cells", "held_out_seeds", "isolation", "checks"),
     *("machine", "num_threads", "cpu", "versions"),
 )
-"""Of ``verification.json``; others are unknown."""
 
 DIGITS = 12
-"""Of a digest, for readers."""
 
 
 class Verification(NamedTuple):

@@ -10,7 +10,6 @@ from ctgraph_rl.report.sections import Section
 from ctgraph_rl.report.style import MOST_AGENTS, agent_style, agents_legend, frames_axis, panels, short
 
 MOST_EXPERIMENTS = 12
-"""Curricula that have a panel."""
 
 COLUMNS = 3
 

@@ -26,7 +26,6 @@ NEGATIVE = -0.05
 """Share of the scale from which a cell without number is marked as negative."""
 
 NO_VALUE = (0.85, 0.85, 0.85)
-"""Colour of a cell without a value."""
 
 
 def transfer_maps(section: Section, result: Result, trees: Trees) -> CaptionedFigure:

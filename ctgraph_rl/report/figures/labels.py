@@ -13,13 +13,11 @@ from ctgraph_rl.report.style import figure_width, frames_axis, ink, new_figure, 
 from ctgraph_rl.runs.read import Run, split_by
 
 MOST_STRIPS = 30
-"""Runs that have a strip."""
 
 NARROWEST = 0.03
 """Share of the frames from which a part of a strip has a number."""
 
 NOT_LEARNED = 0.35
-"""Opacity of frames that were not learned from."""
 
 SEVERAL = (0.85, 0.85, 0.85)
 """Colour of blocks with several tasks, and of labels that acted only there."""

@@ -24,7 +24,6 @@ from ctgraph_rl.report.style import MOST_AGENTS, agent_style, agents_legend, bes
 from ctgraph_rl.runs.read import histories
 
 MOST_TASKS = 32
-"""Tasks that have a panel."""
 
 MANY_BLOCKS = 12
 """Blocks from which the lines at their ends are thinner."""
