@@ -259,17 +259,17 @@ def test_seeds_that_cannot_be_one_batch_are_run_as_alone_one_after_the_other(mon
             raise FloatingPointError("the loss is NaN")
 
     monkeypatch.setattr(job, "run_job", run_job)
-    code = sweep(monkeypatch, "seed=0,1", *TINY, "agent=lstm_ppo", "agent.num_envs=8", "together=true")
+    code = sweep(monkeypatch, "seed=0,1", *TINY, "agent=drqn", "agent.num_envs=8", "together=true")
 
     said = capsys.readouterr()
     assert (code, ran) == (1, [(0, "seed0"), (1, "seed1")])
-    assert "note: seeds are trained one after the other, as LSTMPPO cannot be" in said.err
+    assert "note: seeds are trained one after the other, as DRQN cannot be" in said.err
     assert "seed 0: FloatingPointError: the loss is NaN" in said.out
 
 
 @pytest.mark.slow
 def test_seeds_that_cannot_be_one_batch_are_trained_as_alone(monkeypatch):
-    settings = ("seed=0,1", *TINY, "agent=lstm_ppo", "agent.num_envs=8", "agent.num_steps=8")
+    settings = ("seed=0,1", *TINY, "agent=drqn", "agent.num_envs=8", "agent.num_steps=8")
 
     assert sweep(monkeypatch, *settings, "together=true") == 0
     sweep(monkeypatch, *settings, "hydra.sweep.dir=alone")
