@@ -119,8 +119,6 @@ class Ours:
     """An agent of this package.
 
     Args:
-        name: the agent.
-        task: what it learns.
         seed: decides weights, exploration and environment.
         cell: a file of ``conf/cell``; None: the agent's.
     """

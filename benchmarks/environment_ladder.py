@@ -227,8 +227,6 @@ def climb(rungs: list[Rung], options: Options, device: torch.device, in_turn: bo
     """Measure a ladder as the options say, or until Ctrl-C.
 
     Args:
-        rungs: the ladder.
-        options: of the command line.
         device: of all rungs.
         in_turn: every round measures each rung once, so that all suffer alike; else each rung is made, measured and
             dropped.

@@ -55,7 +55,6 @@ class Stable:
     Args:
         name: the corresponding agent of this package.
         given: our hyperparameters.
-        task: what it learns.
         way: one of `ways`.
         seed: decides weights and exploration.
     """

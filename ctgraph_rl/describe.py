@@ -99,7 +99,6 @@ def describe(curriculum: Curriculum, frames_per_second: float | None = None) -> 
     """The curriculum at large, its blocks and, for CT-graphs, its tasks' difficulty, ceilings and observability.
 
     Args:
-        curriculum: any curriculum.
         frames_per_second: for the estimated time; None: that of `AGENT`.
 
     Raises:

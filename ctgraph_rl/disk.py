@@ -27,7 +27,6 @@ def write_whole(path: str | os.PathLike[str], content: bytes | str, synced: bool
     """Write a file so that a reader, also after a crash, finds the old content or the new; a link is replaced.
 
     Args:
-        path: the file.
         content: text is written in UTF-8.
         synced: whether it must survive a power cut; False for what no run resumes from.
 
@@ -191,7 +190,6 @@ def appending(path: Path, known: os.stat_result) -> Iterator[int]:
     """Open a file again that this process made, to append to it.
 
     Args:
-        path: the file.
         known: its earlier state; another file is refused.
 
     Raises:

@@ -151,7 +151,6 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
     Row i has the random stream of seed ``seed + i``, or ``seed[i]``. Returned arrays are not changed later.
 
     Args:
-        num_envs: number of rows.
         task: as in `make_task`, also ``config`` and ``changes``; or a list of a task per row.
         task_pool: tasks that `set_tasks` takes. Default: the rows' tasks.
         task_ids: as in `CTGraphGymEnv`, also ``num_task_ids``; ids are uint8 [num_envs, num_task_ids].

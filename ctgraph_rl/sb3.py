@@ -27,7 +27,6 @@ class SB3VecEnv(VecEnv):
     ``VecMonitor(SB3VecEnv(256, "CT-SU-B1"))`` records returns and lengths of episodes.
 
     Args:
-        num_envs: number of rows.
         task: as in `CTGraphVectorEnv`, also all others but the autoreset mode.
         task_ids: the id of each task of the pool, such as ``curriculum.task_ids``. Observations are then a dict of
             ``observation`` and ``task_id``, uint8 [num_envs, num_task_ids]: the row's id as one-hot.

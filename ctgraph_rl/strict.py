@@ -57,9 +57,8 @@ def json_value(content: bytes, finite: bool = True, nesting: int = MAX_NESTING) 
     """Return the value of a JSON text in UTF-8.
 
     Args:
-        content: the text.
         finite: refuse NaN and infinity, which are not JSON.
-        nesting: most objects and lists within each other.
+        nesting: at most.
 
     Raises:
         ValueError: for anything but JSON, repeated keys, too long integers, and too deep nesting.
@@ -85,10 +84,9 @@ def json_object(
     """Return a source's name, for errors, and its JSON object.
 
     Args:
-        path_or_dict: a file, or its content.
         name: of a content without a file.
         most: bytes of a file.
-        nesting: most objects and lists within each other.
+        nesting: at most.
 
     Raises:
         ValueError: for an unreadable file, or another value.

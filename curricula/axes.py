@@ -94,7 +94,6 @@ def random_goals(tasks: OneOrMore, num_goals: int, seed: int) -> Tasks:
     """Different goals drawn uniformly, the same for graphs of one shape.
 
     Args:
-        tasks: a task or several.
         num_goals: at most b^d.
         seed: an integer >= 0.
     """
@@ -136,7 +135,6 @@ def shifted_ids(tasks: OneOrMore, shifts: Iterable[int], kinds: Sequence[str] = 
     Generated sets grow to the longest that is needed, so that unmoved images look the same in all tasks.
 
     Args:
-        tasks: a task or several.
         shifts: how far ids move; 0 is the task itself.
         kinds: some of home, fail, wait, decision and end.
     """
@@ -164,7 +162,6 @@ def new_images(tasks: OneOrMore, num_sets: int, kinds: Sequence[str] = ("decisio
     """Each task, and again with new images for some kinds of states: the paper's variant and invariant features.
 
     Args:
-        tasks: a task or several.
         num_sets: sets of images, the task's own included.
         kinds: the states whose images change.
     """
@@ -189,7 +186,6 @@ def read_variation(tasks: OneOrMore, read_noise: int, read_rotation: int = 0) ->
     """Each task with images that vary on every read.
 
     Args:
-        tasks: a task or several, with images.
         read_noise: largest addition to each pixel, in 0..255.
         read_rotation: largest rotation in whole degrees, in 0..359.
     """
@@ -293,7 +289,6 @@ def random_tasks(
     """Different tasks on random graphs: each choice is uniform and independent, then a uniform goal.
 
     Args:
-        num_tasks: how many.
         seed: an integer >= 0.
         branching_factors: choices of b.
         depths: choices of d.
@@ -398,7 +393,6 @@ def split(tasks: OneOrMore, num_held_out: int, seed: int) -> tuple[Tasks, Tasks]
     """Tasks to train and tasks to hold out, drawn without replacement, each in their order.
 
     Args:
-        tasks: different tasks.
         num_held_out: fewer than there are.
         seed: an integer >= 0.
     """

@@ -68,7 +68,7 @@ def configured(configuration: str, image_seed: int = 1) -> Task:
     """The task of a configuration such as ``su_b1``, its goal at the first branches.
 
     Raises:
-        ValueError: for an unknown configuration; lists the choices.
+        ValueError: lists the configurations.
     """
     unknown = f"unknown configuration {configuration!r}: {did_you_mean(str(configuration), KINDS)}"
     require((configuration in KINDS, unknown))
@@ -90,7 +90,6 @@ def goal_location(configuration: str, num_frames: int = FRAMES, image_seed: int 
     """All goals of one graph in lexicographic order: does a new goal overwrite the old one?
 
     Args:
-        configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
         num_frames: frames per task.
         image_seed: seed of the shared image set.
     """
@@ -111,7 +110,6 @@ def instances(
     a table of observations does not solve the tasks.
 
     Args:
-        configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
         num_frames: frames per task.
         image_seed: seed of the shared image set.
         read_noise: largest addition to each pixel, in 0..255.
@@ -128,7 +126,6 @@ def depth_growth(configuration: str, num_frames: int = FRAMES, image_seed: int =
     no image changes its role.
 
     Args:
-        configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
         num_frames: frames per task.
         image_seed: seed of the shared image set.
     """
@@ -142,7 +139,6 @@ def input_variation(configuration: str, num_frames: int = FRAMES, image_seed: in
     """One graph and one goal, shown through four image sets: is the same decision found behind other inputs?
 
     Args:
-        configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
         num_frames: frames per task.
         image_seed: seed of the first image set; the others have the next three.
     """
@@ -154,7 +150,6 @@ def uncorrelated(configuration: str, num_frames: int = FRAMES, image_seed: int =
     """Four tasks with only the shape of the graph in common: each has its own goal and image set.
 
     Args:
-        configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
         num_frames: frames per task.
         image_seed: seed of the first image set; the others have the next three. It also draws the goals.
     """
@@ -171,7 +166,7 @@ def dissimilar(configuration: str, num_frames: int = FRAMES, image_seed: int = 1
     (3, 2), (2, 3) and (3, 3).
 
     Args:
-        configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1; gives the wait probability and what is observed.
+        configuration: gives the wait probability and what is observed.
         num_frames: frames per task.
         image_seed: seed of the first image set; the others have the next three.
     """
@@ -189,7 +184,6 @@ def new_decisions(configuration: str, num_frames: int = FRAMES, image_seed: int 
     Only the new decision images have to be learned.
 
     Args:
-        configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
         num_frames: frames per task.
         image_seed: seed of the shared image set.
     """
@@ -202,7 +196,6 @@ def new_waits(configuration: str, num_frames: int = FRAMES, image_seed: int = 1)
     Only the new wait images have to be learned.
 
     Args:
-        configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
         num_frames: frames per task.
         image_seed: seed of the shared image set.
     """
@@ -220,7 +213,6 @@ def similar_goals(name: str, depth: int, num_shared: int, num_frames: int = FRAM
     Section 3.4.1 of the paper, "surjective graph with similar reward locations".
 
     Args:
-        name: of the curriculum.
         depth: d of the graph, with b=2 and p=0.
         num_shared: shared first decisions, below d; there are 2^(d - num_shared) goals.
         num_frames: frames per task.

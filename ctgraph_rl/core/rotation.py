@@ -16,7 +16,6 @@ def rotate(images: Tensor, degrees: int) -> Tensor:
 
     Args:
         images: uint8 [n, r, r].
-        degrees: whole degrees.
 
     Returns:
         uint8 [n, r, r], rounded; weights have 16 bits.

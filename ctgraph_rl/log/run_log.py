@@ -299,7 +299,6 @@ class RunLog:
         """A field of each task's evaluation after the curriculum's last block, float64 [tasks], or NaN.
 
         Args:
-            name: the field.
             num_tasks: as in `performance`.
         """
         evaluations = self._evaluations(during=False)

@@ -48,7 +48,6 @@ def scores(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None
 
     Args:
         log: a whole run.
-        curriculum: what was learned.
         experts: for each of ``curriculum.tasks``, the log of its single-task expert.
 
     Raises:

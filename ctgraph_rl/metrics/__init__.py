@@ -77,7 +77,6 @@ def of_regimes(regimes: Sequence[Regime], experts: Mapping[str, Sequence[Tensor]
     """Compute the lifelong metrics of regimes; `prepare` them first for the numbers of l2metrics' defaults.
 
     Args:
-        regimes: a run.
         experts: for each task, its experts' training curves.
     """
     return of_inputs({"regimes": regimes, "experts": experts or {}})

@@ -66,7 +66,6 @@ def prepare(regimes: Regimes, experts: Experts | None = None, ranges: Ranges | N
     """Smooth training and scale each task to 1..101, as l2metrics does before it measures.
 
     Args:
-        regimes: a run.
         experts: each task's experts' training curves.
         ranges: lowest and highest performance of each task; by default of the smoothed run and its experts. An empty
             range gives 1 throughout.

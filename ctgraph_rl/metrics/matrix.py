@@ -145,8 +145,6 @@ def isolated_forgetting(performance: Tensor, trained: Trained | None = None, sca
     more cycles a task's own later trainings, too. Undefined where a block trains several tasks, and for a single task.
 
     Args:
-        performance: the matrix.
-        trained: the tasks of each block.
         scale: what each task's changes are divided by; default: max |R[i, task]| of this matrix. The source takes it
             over all seeds of a model, so that models are not comparable: give the known optimum.
     """

@@ -40,7 +40,6 @@ def stage_areas(curves: Curves, trapezoids: bool = False) -> Tensor:
     """Each task's area under its curve over its own block, [tasks]; NaN where a definition has none.
 
     Args:
-        curves: the evaluations of a run.
         trapezoids: `trapezoid_area` instead of `mean_area`.
     """
     area = trapezoid_area if trapezoids else mean_area

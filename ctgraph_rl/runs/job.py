@@ -439,7 +439,7 @@ def is_finished(cfg: DictConfig, run_dir: Path) -> bool:
 def changed_code(cfg: DictConfig, run_dir: Path, known: dict[str, NamedValues]) -> tuple[list[str], bool]:
     """Return in words the code that changed since a run in a directory, and whether some is unknown.
 
-    Nothing has for a run that was stopped before its first checkpoint. ``known`` keeps the code of configurations.
+    Before a run's first checkpoint no change counts. ``known`` keeps the code of configurations.
     """
     about = first_line(run_dir) if holds_results(run_dir) else None
     if about is None:

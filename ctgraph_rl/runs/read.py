@@ -111,11 +111,9 @@ class Run:
     """A run directory as data.
 
     Args:
-        path: the directory.
         about: the first line of its log.
         agent: class or name of the learner, ``PPO + EWC`` with a method, if known.
         settings: the configuration without seed and fingerprint, by dotted keys; with the folder if there is no agent.
-        seed: the seed.
         reason: why it has no results; None for a finished run.
         metrics: `Metric` fields by name; empty without results.
         values: everything that tables show; empty for an unreadable log.
@@ -222,7 +220,6 @@ def find_runs(paths: Iterable[Path | str], count: Count = silent) -> tuple[list[
     Single-task experts are silently left out beside other runs.
 
     Args:
-        paths: directories.
         count: called after each file that is read.
     """
     found: list[Run] = []

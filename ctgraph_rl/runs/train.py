@@ -120,7 +120,7 @@ def train(
 
     Args:
         agent: just built by `new_agent`, which decides torch's global generator.
-        run_dir: an existing directory.
+        run_dir: must exist.
         seed: in [0, 2**63).
         device: of environment and agent.
         config: for the log's first line beside the seed, as JSON.

@@ -54,12 +54,12 @@ def ct_graph(
 
 @takes_numbers
 def observations_of(graph: CTGraph, kind: str, num_wait_images: int = 100) -> Observations:
-    """Return observations with ids from 2 on: waits, decisions, ends where states have their own, else decisions first.
+    """Return observations with ids from 2: waits, decisions, ends if states have their own, else decisions first.
 
     Args:
         kind: ``full``, an id for each state; ``decisions``, as full but one id for all wait states; ``surjective``, one
             id for each kind of state; ``confounding``, as surjective but wait states draw one of several ids.
-        num_wait_images: ids of wait states, for ``confounding``.
+        num_wait_images: for ``confounding``.
 
     Raises:
         ValueError: for an unknown kind, or no wait images.

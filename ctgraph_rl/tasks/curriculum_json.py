@@ -1,11 +1,10 @@
 """Curricula as JSON, so that others can use one without this package.
 
-Every field is written out, defaults too, under the names that the classes have. The different tasks are listed once,
-first those that blocks train, then those held out; blocks and ``held_out`` name them by position, from 0. ``type`` says
-which of several classes a part is. ``fingerprint`` is that of `Curriculum`; ``about`` holds numbers that follow from
-the rest and is not read. A goal is a text, ``"1.2"``. A field
-that was added later, ``field(default=..., metadata={"added": True})`` with a default that means "as before", may be
-missing: older files have none.
+Every field is written out under its name in Python, a goal as text, ``"1.2"``. The different tasks are listed once,
+trained ones first; blocks and ``held_out`` name them by position, from 0. ``type`` says which of several classes a part
+is. ``fingerprint`` is that of `Curriculum`; ``about`` holds numbers that follow from the rest and is not read. A file
+may lack a field that was added later: ``field(default=..., metadata={"added": True})``, where the default means "as
+before".
 """
 
 from __future__ import annotations

@@ -67,7 +67,6 @@ def read_paper_json(source: str, content: ReadOnlyValues, goal: Goal | None) -> 
 
     Args:
         source: the file, for messages.
-        content: its content.
         goal: d decisions in 1..b, such as ``"1.2"``.
 
     Raises:
@@ -114,7 +113,6 @@ def shown_ids(graph: CTGraph, found: ReadOnlyValues) -> Observations:
     """Return the ids of wait, decision and end states: given ones, else the next free.
 
     Args:
-        graph: the tree.
         found: ``unique_waits`` and ``unique_decisions``; optional ``wait_ids`` and ``decision_ids``.
     """
     sizes = {

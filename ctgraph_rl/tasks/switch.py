@@ -52,7 +52,7 @@ class _ForEpisodes:
 
 @dataclass(frozen=True)
 class ByEpisode(_ForEpisodes):
-    """The tasks take turns, each for a number of episodes.
+    """The tasks take turns.
 
     Args:
         episodes: episodes of a turn.

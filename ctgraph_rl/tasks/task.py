@@ -165,8 +165,6 @@ class Task:
             path: must not exist.
             general_seed: seed of the authors' environment, in [0, 2**32).
 
-        Returns:
-
         Raises:
             ValueError: lists everything of the task that the file cannot express.
         """

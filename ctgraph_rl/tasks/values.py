@@ -133,7 +133,6 @@ def memoryless_ceiling(task: Task, deterministic: bool = False) -> float:
     A deterministic policy here is a function of the id; noise and rotation on read could serve it as dice.
 
     Args:
-        task: as above.
         deterministic: consider only policies that map an id to one action.
 
     Raises:

@@ -30,7 +30,7 @@ class ImageFile:
         size: side of an observation in pixels: a multiple of r repeats pixels, a divisor averages blocks; None: r.
 
     Raises:
-        ValueError: for a missing file, another content than the hash says, or another kind of array.
+        ValueError: for a missing file, another hash, or another kind of array.
     """
 
     path: str = field(compare=False)

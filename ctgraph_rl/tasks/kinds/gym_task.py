@@ -32,7 +32,7 @@ ALREADY = {
 
 @dataclass(frozen=True, eq=False)
 class GymTask:
-    """An environment of Gymnasium: any id with a time limit whose observations are images, vectors or integers.
+    """An environment of Gymnasium with a time limit, and images, vectors or integers as observations.
 
     `ctgraph_rl.tasks.kinds.gym_spaces.ObservationForm` says how observations are shown. Actions are integers; our
     agents refuse continuous ones.
@@ -57,7 +57,7 @@ class GymTask:
         channels: where images have their channels, ``first`` or ``last``; None: found by the length of the axis.
 
     Raises:
-        ValueError: for a value that breaks a rule. The environment's own refusals come when it is first made.
+        ValueError: for a value that breaks a rule; the environment may refuse more when it is made.
 
     Example:
         >>> GymTask("FrozenLake-v1", {"is_slippery": False}).optimal_value(1.0)
