@@ -5,12 +5,11 @@ Ladosz et al. 2021, "Deep reinforcement learning with modulated Hebbian plus Q-n
 sigmoid(W_h y) with y = tanh(phi + noise - average), which is not. It acts greedily on q + u, or at random. After y,
 average <- d average + (1 - d) phi.
 
-After each action the eligibility decays, E <- exp(-1 / tau) E, and its row of that action changes by +c where y is
-largest, by -c where it is smallest, and by -h elsewhere; E = 0 at the start of an episode. With reward r, W_h <-
-clip(W_h + (sign(r) - b) E, -1, 1). So a wait does not hide the decision from the reward. Targets are r + gamma max(q' +
-u') with a copy of all weights and the transition's stored average. The published loss is |q - target|^2: the prediction
-lacks u, and q, at most 1, cannot reach a target above 1. ``predict_sum`` corrects it to |q + u - target|^2 with a
-constant u.
+After each action the eligibility decays, E <- exp(-1 / tau) E. Its row of that action changes by +c where y is largest,
+by -c where it is smallest, and by -h elsewhere. E = 0 at the start of an episode. With reward r, W_h <- clip(W_h +
+(sign(r) - b) E, -1, 1). So a wait does not hide the decision from the reward. Targets are r + gamma max(q' + u') with a
+copy of all weights and the transition's stored average. The published loss is |q - target|^2: the prediction lacks u,
+and q, at most 1, cannot reach a target above 1. ``predict_sum`` corrects it to |q + u - target|^2 with a constant u.
 
 One environment and batches of one step give the paper's updates exactly. With more, W_h changes after the batch, step
 by step, by the sum over environments; each has an E and an average, and a new one starts with the mean average. The

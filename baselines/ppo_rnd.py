@@ -14,8 +14,8 @@ paper:
 - Each announced task starts with a new predictor, critic of the bonus and statistics.
 - Statistics of observations start with the first batch, not with a random policy.
 
-The agent holds 12 bytes for each weight of the predictor and of the bonus's critic, 4 for each of the random network,
-16 for each pixel and 4 for each environment, beside PPO's.
+Beside PPO's, the agent holds 12 bytes for each weight of the predictor and of the bonus's critic. Each weight of the
+random network and each environment takes 4, each pixel 16.
 """
 
 from __future__ import annotations

@@ -75,7 +75,6 @@ class L2D2C(MaskExchange):
         return {"task": task, "reward": self.return_of(member, task)}
 
     def _best(self, member: int, received: Sequence[Message]) -> list[Message]:
-        """Return the message of the highest return that still concerns the task, if any."""
         task = self.task_of(member)
         own = self.return_of(member, task)
         wanted = []

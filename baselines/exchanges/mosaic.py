@@ -42,7 +42,7 @@ LARGEST_RETURN = 0.9999
 class Mosaic(MaskExchange):
     """Each member sends its task's embedding to all others, and combines masks of similar ones with a higher return.
 
-    After each batch a member's z becomes (z + e) / 2, at first e / 2, where e is the linear Wasserstein embedding of
+    After each batch a member's z becomes (z + e) / 2, at first e / 2. e is the linear Wasserstein embedding of
     ``num_samples`` of the last ``buffer_size`` transitions. Its last mean return is r. A peer offers its mask if the
     cosine of both z is at least ``threshold`` and its return is above r. The member requests the ``top_n`` most similar
     ones. Its own scores become its present combination, with an initial share of 0.5 + 0.5 r, r clipped to [0, 0.9999],
@@ -168,7 +168,6 @@ class Mosaic(MaskExchange):
         return helps
 
     def _offers(self, member: int, query: Message) -> list[Message]:
-        """Return an offer if the tasks are similar and the member's return is higher."""
         embedding = self.known[member].embedding
         own = self._own_return(member)
         if embedding is None or (self.use_return and own <= query.content["reward"]):
@@ -183,7 +182,6 @@ class Mosaic(MaskExchange):
         return self.return_of(member, self.task_of(member))
 
     def _best(self, member: int, received: Sequence[Message]) -> list[Message]:
-        """Return the most similar messages, one of each sender, that still concern the member's task."""
         task = self.task_of(member)
         newest = {each.sender: each for each in received if each.content["task"] == task}
         return sorted(newest.values(), key=lambda each: (-each.content["similarity"], each.sender))[: self.top_n]

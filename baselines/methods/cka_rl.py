@@ -30,8 +30,8 @@ class CKARL(TaskMethod):
     All other weights are shared. An earlier task is played with its w and the present other weights. A task that
     returns trains its w further, without a mixture.
 
-    Stored are w_base, the pool and v_k, 4 S bytes each, and w of each of the curriculum's tasks, 4 S bytes, where S is
-    the number of weights in ``scope``.
+    Stored are w_base, v_k, the pool's vectors and w of each of the curriculum's tasks, 4 S bytes each; S is the number
+    of weights in ``scope``.
 
     Args:
         scope: ``actor_head``, the output layer that decides the action, as published, or ``all`` weights.
@@ -157,7 +157,6 @@ class CKARL(TaskMethod):
         return [each for each, inside in zip(tensors, self.inside, strict=True) if inside]
 
     def _add(self, vector: Tensor) -> None:
-        """Add a vector to the pool; if full, the mean of the two most similar ones replaces them."""
         vectors = torch.cat([self.pool[: self.num_pooled], vector.unsqueeze(0)])
         if len(vectors) > self.pool_size:
             vectors = merged(vectors)

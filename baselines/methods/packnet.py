@@ -30,8 +30,8 @@ class PackNet(TaskMethod):
     later tasks. A task acts with the weights of the tasks up to it. Biases are the first task's; each task has separate
     output layers (`Heads`), which are all that a returning task trains.
 
-    Stored are each weight's owner, 2 P bytes, whether it may change and whether the present task uses it, 2 P bytes,
-    its value, 4 P bytes, and the output layers.
+    Stored are the output layers and, of each weight, its owner (2 P bytes), whether it may change and is in use (2 P),
+    and its value (4 P).
 
     Args:
         retrain: share of a block's frames, at its end, that is trained after pruning, in [0, 1).
@@ -120,7 +120,6 @@ class PackNet(TaskMethod):
 
     @torch.no_grad()
     def _prune(self) -> None:
-        """Keep the largest of the trained free weights, and free the others."""
         trained = self.live & ~self._on_device(self.in_heads) & (self.owner == FREE)
         if not trained.any():
             return

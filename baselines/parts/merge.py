@@ -59,9 +59,9 @@ def merged_outputs(policy: Any, trunk: Any, batch: Data) -> tuple[Data, TensorsB
 def merge(batch: Data) -> tuple[Tensor, Items]:
     """Merge frames of the same history, action, old log-probability and sign of advantage.
 
-    They have one probability ratio and one value V. So their loss is n times that of their mean advantage, and a
-    critic's squares are n (V - m)^2 + S, where m is their mean target and S the squares around it. Means are float64: V
-    is near m when trained, and advantages cancel.
+    They have one probability ratio and one value V. So their loss is n times that of their mean advantage. A critic's
+    squares are n (V - m)^2 + S, with their mean target m and the squares S around it. Means are float64: V is near m
+    when trained, and advantages cancel.
 
     Returns:
         A frame of each kind, int64 [num_kinds]; and its action, old log-probability, mean ``advantage`` and

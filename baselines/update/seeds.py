@@ -179,7 +179,6 @@ class SeedGroup:
         return sampled(outputs, noise)
 
     def _explored(self, outputs: Mapping[str, Tensor]) -> TensorsByName:
-        """Return the best actions, or random ones where an agent explores."""
         actions = outputs["action_value"].argmax(dim=-1)
         for number, (learner, action) in enumerate(zip(self.learners, actions, strict=True)):
             with self.random(number):

@@ -138,7 +138,6 @@ class Stack:
 
 
 def _keep(kept: TensorsByName, name: str, value: Tensor) -> None:
-    """Write a value into a named tensor, which the first call makes."""
     if name in kept:
         kept[name].copy_(value)
     else:

@@ -125,7 +125,6 @@ def _seen(state: UpdateState) -> TensorsByName:
 
 
 def _descend(learner: Trained, weights: Sequence[Tensor], state: UpdateState, gradients: Sequence[Tensor]) -> Tensor:
-    """Take the optimiser's step; return the gradients' norm, of each seed if there are several."""
     is_stacked = state.tensors is not None
     if is_stacked:
         gradients = [unstacked(gradient) for gradient in gradients]

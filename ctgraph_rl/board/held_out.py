@@ -74,7 +74,6 @@ def held_out_checks(submission: Submission, results: Sequence[tuple[RerunCell, R
 
 
 def _of_the_protocol(submission: Submission, curriculum: Curriculum, seed: int, log: RunLog) -> list[Check]:
-    """Return the checks that the log of another seed has all frames and evaluations of its curriculum."""
     run = replace(submission.finished[0], seed=seed, run=f"seed {seed}")
     checks = of_the_protocol(replace(submission, curriculum=curriculum), run, log)
     return [check._replace(level=HELD_OUT) for check in checks]

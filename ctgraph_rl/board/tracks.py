@@ -137,7 +137,6 @@ class Track:
         return held_out_seeds(f"{self.id} {digest} {number}", count)
 
     def _of_rung(self, rung: Sequence[str], composed: Any) -> Iterator[Variant]:
-        """Yield the variants of a rung, from the configuration with its choices of groups."""
         cfg = deepcopy(composed)
         for setting in filter(_is_value, rung):
             key, _, value = setting.partition("=")

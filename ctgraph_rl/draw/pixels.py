@@ -65,7 +65,7 @@ def render(
     """Draw every row: its observation and its tree with the goal and the current position.
 
     A star is below the goal, a thick dark line is the way so far, and a black outline the current state. On failure the
-    outline is around the fail mark, top right, and a cross at the decision state, also for the wait state before it, or
+    outline is around the fail mark, top right. A cross is at the decision state, also for the wait state before it, or
     at the wait state before an end. A small cross marks swapped branches. Trees that are too wide show the paths to the
     current node and the goal, with stubs.
 

@@ -227,7 +227,6 @@ class _TaskPicture:
         return write_ids(self.task, state, self.layout.level[state[1]]) if self.ids else INITIALS[state[0]]
 
     def _draw_goal(self) -> None:
-        """A star below the goal, and decisions below the end states of a tree that is not whole."""
         size = max(7.0, min(13.0, self.size))
         drop = -0.5 * self.size - 0.6 * size
         self.axes.plot(

@@ -119,7 +119,6 @@ def learn_collective(
         log: of the collective: lines ``exchange`` for messages and ``help`` for what members took over. The members'
             own logs also have the latter. Default: a new one in memory.
         progress: updated after each round with the frames of all members and their mean return.
-        device: of environments and agents.
         saved: a state that ``checkpoint`` was given, to resume with the same bits. Members are built the same way, and
             their logs hold what they held then.
         checkpoint: is offered the state after each round.

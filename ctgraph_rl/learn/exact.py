@@ -359,7 +359,6 @@ class _Enumeration:
         return seen, probs.double(), written
 
     def _after(self, seen: _Histories, written: Step, chance: Tensor, action: int) -> _Histories:
-        """Return the histories that take an action with a probability over 0."""
         state = {}
         for key, value in seen.state.items():
             state[key] = written.get(("next", key), value)

@@ -106,11 +106,11 @@ class Group(Protocol):
         ...
 
     def start_task(self, task: int | None = None) -> None:
-        """Begin a task, as `ctgraph_rl.agent.Agent`."""
+        """Begin a task."""
         ...
 
     def end_task(self) -> None:
-        """End a task, as `ctgraph_rl.agent.Agent`."""
+        """End a task."""
         ...
 
     def learn(self, batch: TensorDictBase) -> Sequence[Learnt]:

@@ -147,7 +147,6 @@ def log_training(
 
 
 def _split_at_ends(batch: TensorDictBase, start: int, ends: Sequence[int]) -> Iterator[TensorDictBase]:
-    """Cut a batch that begins after ``start`` frames where blocks end."""
     rows, steps = batch.shape
     first = bisect_right(ends, start)
     last = bisect_left(ends, start + batch.numel())

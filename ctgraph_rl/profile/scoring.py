@@ -108,8 +108,8 @@ def _exact_interval(results: Sequence[Measured]) -> tuple[float, float]:
 def _paired_interval(results: Sequence[Measured]) -> tuple[float, float]:
     """Return the scores r that no control contradicts.
 
-    With areas A of a seed and C of its control, both in [0, 1], r is the score above this control where the mean of A -
-    C - r(1 - C) is 0. Its values are within [-1, 1 - r], so r is contradicted where Gaffke's interval of their mean
+    A is the area of a seed, C that of its control, both in [0, 1]. r is the score above this control where the mean of
+    A - C - r(1 - C) is 0. Its values are within [-1, 1 - r], so r is contradicted where Gaffke's interval of their mean
     leaves out 0. The score is the lowest one above a control.
     """
     lows = []

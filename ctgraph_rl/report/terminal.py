@@ -117,7 +117,7 @@ def sparklines(evaluations: Mapping[str, Curve], bars: str = BARS, most: int = M
 def _tasks(name: str, history: History, curves: Mapping[str, str]) -> Table:
     """Return a line for each task: its return before training, its best one after a block, its last one, and its curve.
 
-    A best that is not above 0 has no block.
+    A best of 0 or less has no block.
     """
     where = f"performance.csv has it after each of {len(history.ends) - 1} blocks"
     table = Table(title=_text(f"{name}: mean return on each task; {where}"))

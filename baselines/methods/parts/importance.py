@@ -165,7 +165,6 @@ class Samples:
 
 
 def _joined(minibatches: Sequence[Items]) -> NamedValues:
-    """Return concatenated minibatches of items of one shape, with their sizes."""
     items = {key: torch.cat([minibatch[key] for minibatch in minibatches]) for key in minibatches[0]}
     return {"sizes": [len(minibatch["action"]) for minibatch in minibatches], "items": items}
 

@@ -285,7 +285,6 @@ class SelfLabelledAgent(nn.Module):
             self.learner.load_state_dict(deepcopy(snapshot["state"]))
 
     def _try_next(self) -> None:
-        """Try the next label; after the last one open a new one, if there is room."""
         if self.waiting:
             self.label = self.waiting.pop(0)
             self.num_tried = 0
