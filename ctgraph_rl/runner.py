@@ -15,8 +15,8 @@ from ctgraph_rl.packages import makes_page
 from ctgraph_rl.report.objective import check_objective, objective_of
 from ctgraph_rl.report.style import require_packages
 from ctgraph_rl.report.terminal import print_summary
+from ctgraph_rl.runs import job
 from ctgraph_rl.runs.config import in_sweep
-from ctgraph_rl.runs.job import run_job, run_seeds
 
 
 def run_configuration(cfg: Any, run_dir: Path) -> float | None:
@@ -29,9 +29,9 @@ def run_configuration(cfg: Any, run_dir: Path) -> float | None:
         run_collective(cfg, run_dir)
         run_dirs = list_members(run_dir)
     elif "seeds" in cfg:
-        run_dirs = run_seeds(cfg, run_dir)
+        run_dirs = job.run_seeds(cfg, run_dir)
     else:
-        run_job(cfg, run_dir)
+        job.run_job(cfg, run_dir)
         run_dirs = [run_dir]
     if "exchange" not in cfg and (cfg.report or not in_sweep()):
         for each in run_dirs:
