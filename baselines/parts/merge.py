@@ -1,4 +1,4 @@
-"""Frames of one history as one: each loss that sums over them is computed once.
+"""Frames of one history as one: their losses add up, so that each is computed once.
 
 Used on CPUs for batches with few histories, as without noise on reading.
 """

@@ -1,4 +1,4 @@
-"""A guide: a navigating policy that acts in an agent's place, less and less, until it finds rewards itself."""
+"""A guide: a navigating policy that acts in an agent's place, less and less, so that first rewards are found."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is refused of a curriculum and an agent before any work, and notes on what begins."""
+"""What is refused of a curriculum and an agent before any work, and notes on them."""
 
 from __future__ import annotations
 
