@@ -93,7 +93,6 @@ class Counter(EnvBase):
 
 
 def _num_steps(num_rows: int) -> int:
-    """Steps in a buffer of observations of 144 bytes."""
     return max(4, min(512, MAX_BUFFER // (num_rows * 144)))
 
 
@@ -162,8 +161,6 @@ def _torchrl(make: Callable[[], EnvBase], prefix: str = "", suffix: str = "") ->
 
 
 class _Random(TensorDictModuleBase):
-    """Uniform actions of three."""
-
     in_keys: tuple[str, ...] = ("observation",)
     out_keys: tuple[str, ...] = ("action",)
 

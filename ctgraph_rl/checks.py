@@ -241,7 +241,6 @@ def _is_number(parameter: Parameter) -> bool:
 
 
 def _is_whole(annotation: object) -> bool:
-    """Return whether an annotation begins with ``int`` and allows no float."""
     return annotation is int or (str(annotation).startswith("int") and "float" not in _words(annotation))
 
 

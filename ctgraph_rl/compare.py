@@ -104,7 +104,6 @@ def _log(path: Path) -> RunLog:
 
 
 def _verdict(found: Sequence[Sequence[LogLine]], bound: float) -> tuple[int, str]:
-    """Return the exit code and a sentence about the measurements."""
     scale: dict[str, float] = {}
     for line in chain(*found):
         for key, value in line.items():
@@ -130,7 +129,6 @@ def _verdict(found: Sequence[Sequence[LogLine]], bound: float) -> tuple[int, str
 
 
 def _is_rounding(one: LogLine, other: LogLine, bound: float, scale: Mapping[str, float]) -> bool:
-    """Return whether two lines differ by rounding only; counts must be equal."""
     for key in _differing(one, other):
         first = one.get(key)
         second = other.get(key)
@@ -142,7 +140,6 @@ def _is_rounding(one: LogLine, other: LogLine, bound: float, scale: Mapping[str,
 
 
 def _differing(one: ReadOnlyValues, other: ReadOnlyValues) -> list[str]:
-    """Return the keys whose values differ or that a side lacks."""
     return [key for key in {**one, **other} if one.get(key) != other.get(key)]
 
 

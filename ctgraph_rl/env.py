@@ -345,7 +345,6 @@ class CTGraphEnv(EnvBase):
         return {"observation": observation, "is_init": is_init, **running, **self._counts(self.rows)}
 
     def _not_done(self) -> RowData:
-        """Make the data of rows that are not done, [N, 1]."""
         false = torch.zeros_like(self.rows.row, dtype=torch.bool).unsqueeze(-1)
         data = {"done": false, "terminated": false}
         if self.info:
@@ -394,7 +393,6 @@ class CTGraphEnv(EnvBase):
 
 
 _SHARED = ("terminated", "step_count", "episode_reward", "reward", "task_id", TASK_NUMBER)
-"""Data that may share memory."""
 
 
 def _own(data: RowData) -> RowData:

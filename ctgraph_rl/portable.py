@@ -32,7 +32,6 @@ class Restart(BaseException):
 
 
 _HELD: list[Any] = []
-"""What `hold` registered with PyTorch, for the same lifetime."""
 
 
 def is_portable() -> bool:

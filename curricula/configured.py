@@ -268,7 +268,6 @@ def _shown(task: Task, ids: ReadOnlyValues) -> Observations:
 
 
 def _in_order(by_seed: Sequence[Tasks], goals: Any, num_goals: int, order: str, seed: int) -> Tasks:
-    """Return each image seed's graphs with their goals, in one order."""
     require(*one_of(ORDERS, order=order), *at_least_one(num_goals=num_goals))
     depths = {graph.graph.depth for graph in by_seed[0]}
     given = goals

@@ -237,7 +237,6 @@ def _curriculum(
     seed_set: int = 1,
     evaluation: Evaluation = MASK_EVALUATION,
 ) -> Curriculum:
-    """Return tasks with the images and ids of a set of image seeds."""
     require((seed_set in SEED_SETS, f"seed_set must be one of {', '.join(map(str, SEED_SETS))}, got {seed_set!r}"))
     seeds = SEED_SETS[seed_set]
     tasks = tuple(one_wait_image(path, seeds[family - 1]) for family, path in named)

@@ -237,7 +237,6 @@ TARGETS = _on_graphs(MIRRORED[2])
 
 
 def _alternating(first: int, depth: int) -> tuple[int, ...]:
-    """The goal 1, 2, 1, ... or 2, 1, 2, ..."""
     return tuple(first if place % 2 == 0 else 3 - first for place in range(depth))
 
 

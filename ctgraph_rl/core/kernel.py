@@ -189,7 +189,6 @@ def _compiled(source: Path, compiler: list[str], folder: Path, key: str) -> Path
 
 
 def _compile(source: Path, compiler: list[str], made: Path) -> None:
-    """Compile the library, without OpenMP where the compiler has none."""
     for openmp in (["-fopenmp"], []):
         command = [*compiler, *_FLAGS, *openmp, str(source), "-o", str(made), "-lm"]
         done = subprocess.run(command, capture_output=True, text=True)

@@ -36,7 +36,6 @@ def _is_same(path: Path, stored: ReadOnlyValues) -> bool:
 
 
 def _is_log(path: Path) -> bool:
-    """Return whether a file is a run's whole log."""
     log = RunLog.read(path)
     return bool(log.of_kind("run")) and not log.torn_lines
 
@@ -76,7 +75,6 @@ def metrics_of(content: bytes) -> NamedValues:
 
 
 def _is_metric(metric: Any) -> bool:
-    """Return whether it has the fields of a metric that tables show."""
     if not (isinstance(metric, dict) and {"value", "definition", "undefined"} <= metric.keys()):
         return False
     number = metric["value"] is None or is_real(metric["value"], -LARGEST, LARGEST)

@@ -77,7 +77,6 @@ def locked_new(folder: Path) -> Iterator[None]:
 
 
 _held: WeakSet[BinaryIO] = WeakSet()
-"""This process's lock files."""
 
 
 def _close_copies() -> None:
@@ -167,7 +166,6 @@ def _lock(path: Path, folder: Path, waiting: Callable[[], object] | None) -> Bin
 
 
 def _is_held_elsewhere(file: BinaryIO, path: Path) -> bool:
-    """Return whether a lock file names a lock that is held."""
     signature, found, name = _read(file).partition(BY_WAY_OF)
     if not found:
         return False
@@ -232,7 +230,6 @@ def _is_still_there(file: BinaryIO, path: Path) -> bool:
 
 
 def _sign(file: BinaryIO, content: bytes) -> None:
-    """Write who we are into a locked file."""
     file.truncate(0)
     file.write(content)
 

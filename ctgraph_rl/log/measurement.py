@@ -36,7 +36,6 @@ def _is_task(value: object) -> bool:
 
 
 def _are_blocks(value: object) -> bool:
-    """Whether it lists each block's tasks by number."""
     return _are(lambda block: block != [] and _are(_is_task, block), value)
 
 
@@ -47,12 +46,10 @@ def _are_sources(value: object) -> bool:
 
 
 def _are_seeds(value: object) -> bool:
-    """Whether it lists a group's seeds."""
     return value is None or _are(is_int, value)
 
 
 def _is_expert(value: object) -> bool:
-    """Whether it says a single-task expert's task."""
     return isinstance(value, Mapping) and _is_task(value.get("task")) and _are_seeds(value.get("together"))
 
 
@@ -144,12 +141,10 @@ def without_time(measurement: ReadOnlyValues) -> NamedValues:
 
 
 def _without_place(expert: Any) -> Any:
-    """Return the log's facts on an expert, without its directory."""
     return {key: value for key, value in expert.items() if key != "run"} if isinstance(expert, dict) else expert
 
 
 def _numbers(measurement: ReadOnlyValues) -> Iterator[int]:
-    """Yield a row's numbers of blocks, tasks and episodes."""
     yield from (measurement[name] for name in ("block", "task", "step") if name in measurement)
     for block in measurement.get("trained", ()):
         yield from block

@@ -37,7 +37,6 @@ def quiet_where_nobody_reads() -> Iterator[None]:
 
 
 def _has_reader() -> bool:
-    """Return whether standard output still has a reader, by an empty line."""
     try:
         print(flush=True)
     except BrokenPipeError:

@@ -103,7 +103,6 @@ class RunLog:
         return f"<RunLog {run['curriculum']!s:.80}, seed {run['seed']}: {counts}>"
 
     def _run(self) -> NamedValues:
-        """Return curriculum, fingerprint and seed, None if unknown."""
         about = (self.of_kind("run") or [{}])[0]
         seed = (about.get("config") or {}).get("seed")
         return {"curriculum": about.get("curriculum"), "fingerprint": about.get("fingerprint"), "seed": seed}
@@ -207,7 +206,6 @@ class RunLog:
         return log
 
     def _check(self, path: Path | str) -> None:
-        """Refuse logs that this version has not written; errors name ``path``."""
         most = FEW + self._num_bytes // BYTES_OF_A_NUMBER
         for number, measurement in enumerate(self.measurements, 1):
             try:
@@ -408,7 +406,6 @@ class RunLog:
         return []
 
     def _evaluations(self, during: bool) -> list[NamedValues]:
-        """Evaluations of the curriculum's tasks."""
         found = []
         for m in self.of_kind("evaluation"):
             if not m.get("held_out") and (during or m.get("moment") != "during"):

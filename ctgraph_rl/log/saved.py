@@ -115,7 +115,6 @@ def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _described(value: Any) -> str:
-    """Return a tensor's type and shape, or a plain value and its type."""
     is_tensor = isinstance(value, torch.Tensor)
     return f"{value.dtype} {list(value.shape)}" if is_tensor else f"{type(value).__name__} {value!r}"
 

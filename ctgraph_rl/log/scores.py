@@ -113,7 +113,6 @@ def protocol_curves(log: RunLog, curriculum: Curriculum) -> Curves:
 
 
 def _facts(curriculum: Curriculum) -> NamedValues:
-    """Return the inputs known before a run."""
     tasks = curriculum.tasks
     known = {
         "trained": curriculum.trained,
@@ -144,7 +143,6 @@ OF_GRAPHS = (
 def _measured(
     log: RunLog, curriculum: Curriculum, best: Tensor | Undefined, experts: Sequence[RunLog] | None
 ) -> NamedValues:
-    """Return the inputs that a finished run measured."""
     count = len(curriculum.tasks)
     curves: Curves | Undefined
     mastery: Curves | Undefined
@@ -204,7 +202,6 @@ def _kind(tasks: Sequence[TaskLike]) -> str:
 
 
 def _check_same(log: RunLog, curriculum: Curriculum) -> None:
-    """Refuse another curriculum than the log's first line says."""
     given = curriculum.fingerprint
     for run in log.of_kind("run"):
         learned = run.get("fingerprint", given)
@@ -255,7 +252,6 @@ def _said_by(tasks: Sequence[TaskLike], member: str, value: Callable[[Any], floa
 
 
 def _of_each(value: Callable[[Any], float], tasks: Sequence[Any]) -> Tensor | Undefined:
-    """Return each task's value, or the reason of the first that has none."""
     try:
         return float64(list(map(value, tasks)))
     except ValueError as error:
@@ -333,7 +329,6 @@ def _interval_best(log: RunLog, curriculum: Curriculum, best: Tensor | Undefined
 
 
 def _labelling(log: RunLog, curriculum: Curriculum) -> Labelling | Undefined:
-    """Return the labels that the learner gave to tasks, if any."""
     acted = log.training("acted_label")
     ends = log.training("frames")
     if not len(acted) or acted.isnan().any():
@@ -382,7 +377,6 @@ def _first_blocks(log: RunLog, curriculum: Curriculum) -> NamedValues:
 def _regimes(
     log: RunLog, curriculum: Curriculum, best: Tensor | Undefined, experts: Sequence[RunLog] | None
 ) -> NamedValues:
-    """Return the run and its experts as regimes."""
     lowest = lowest_returns(curriculum.tasks)
     for each in (best, lowest):
         if isinstance(each, Undefined):

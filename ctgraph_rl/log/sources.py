@@ -203,14 +203,12 @@ def _defined(statement: ast.stmt) -> Iterator[str]:
 
 
 def _root(node: ast.expr) -> ast.expr:
-    """Return the base of an attribute or item, at any depth."""
     while isinstance(node, (ast.Attribute, ast.Subscript)):
         node = node.value
     return node
 
 
 def _imports(tree: ast.AST, package: str) -> Iterator[str]:
-    """Yield the dotted names that statements or ``import_module`` import."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             for alias in node.names:
@@ -236,7 +234,6 @@ def code_text(tree: ast.AST) -> str:
 
 
 def _has_no_effect(node: ast.AST) -> bool:
-    """Return whether a statement, such as a docstring, does nothing."""
     return isinstance(node, ast.Pass) or (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant))
 
 

@@ -361,7 +361,6 @@ def _saturation(values: Tensor) -> tuple[float, int]:
 
 
 def _falls(table: RegimeTable, trainings: Sequence[int]) -> bool:
-    """Whether the least-squares line through a task's training falls."""
     times = torch.cat([torch.arange(table.starts[i], table.starts[i + 1], device="cpu") for i in trainings]).double()
     values = _joined(table, trainings)
     return bool(((times - times.mean()) * (values - values.mean())).sum() < 0)

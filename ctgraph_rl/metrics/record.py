@@ -164,7 +164,6 @@ def defined(
 
 
 def _entry(metric: Callable[..., Metric], meaning: Definition, renamed: Mapping[str, str]) -> Entry:
-    """Return a metric with the inputs of its arguments."""
     name = metric.__name__
     arguments = signature(metric).parameters
     inputs = {}

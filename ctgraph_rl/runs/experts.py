@@ -148,7 +148,6 @@ def _left(run_dirs: RunDirs, what: str, tell: Callable[[str], object]) -> dict[i
 def _train(
     curriculum: Curriculum, learn: Learn, run_dirs: RunDirs, waiting: Callable[[], object], console: Console | None
 ) -> Failures:
-    """Train or resume in directories, waiting for other processes there."""
     failed: Failures = {}
     with Session(console) as session:
         for run_dir in sorted(run_dirs.values()):  # one order, so that no two processes wait for each other
@@ -189,7 +188,6 @@ def begun_with(run_dir: Path) -> list[int]:
 
 
 def _untrained(run_dirs: RunDirs) -> dict[int, Path]:
-    """Return those without results, or with damaged ones."""
     left = {}
     for seed, run_dir in run_dirs.items():
         if not (run_dir / METRICS).exists() or damaged(run_dir):

@@ -109,7 +109,6 @@ def _of_omegaconf(error: OmegaConfBaseException, message: str) -> str:
 
 
 def _unresolved_choice(raw: str) -> str:
-    """Return why a group's choice has no value."""
     setting = next((word for word in sys.argv if word.endswith(f"={raw}")), raw)
     try:
         OmegaConf.to_container(OmegaConf.create({"choice": raw}), resolve=True)
@@ -119,7 +118,6 @@ def _unresolved_choice(raw: str) -> str:
 
 
 def _why_unresolved(message: str, raw: str) -> str:
-    """Return why OmegaConf finds no value, and what to do."""
     why = message.partition("\n")[0].rpartition("raised while resolving interpolation: ")[2].strip('"')
     why = why.replace("Unsupported interpolation type", "there is no resolver")
     if "nvironment variable" in why:
@@ -128,7 +126,6 @@ def _why_unresolved(message: str, raw: str) -> str:
 
 
 def _unknown_file(group: str, name: str, choices: Sequence[str]) -> str:
-    """Return why a group has no such file."""
     extra = LAUNCHERS.get(f"{group}/{name}")
     if extra is not None:
         return f"this launcher is another package: pip install 'ctgraph_rl[{extra}]'"
@@ -158,7 +155,6 @@ def _removed(key: str) -> str:
 
 
 def _says_what_to_do(error: BaseException) -> bool:
-    """Return whether an error says more than its cause."""
     if isinstance(error, OmegaConfBaseException):
         return False
     return isinstance(error, (ValueError, OSError, ModuleNotFoundError))

@@ -126,7 +126,6 @@ def _is_in_queue() -> bool:
 
 
 def _shown_job() -> str:
-    """Return SLURM's facts on this job, or nothing."""
     command = ["scontrol", "show", "job", _job()]
     try:
         return subprocess.run(command, capture_output=True, text=True, timeout=10).stdout
@@ -141,5 +140,4 @@ def _job() -> str:
 
 
 def _requeuing() -> int:
-    """Return the signal by which submitit queues jobs again, or 0."""
     return getattr(signal, "SIGUSR2", 0)

@@ -103,7 +103,6 @@ def load(
 
 
 def _curriculum(run_dir: Path, given: Curriculum | None, fingerprint: Any) -> Curriculum:
-    """Return the given curriculum, or the directory's."""
     path = run_dir / CURRICULUM
     there = given is not None or path.exists()
     require((there, f"{run_dir} has no {CURRICULUM}, as of classes that are not ours: give load(..., curriculum=)"))
@@ -168,7 +167,6 @@ def _ours(run_dir: Path, part: str, settings: Any) -> Callable[..., Any]:
 
 
 def _settings(run_dir: Path, stored: ReadOnlyValues) -> NamedValues:
-    """Return a class's settings, with the cell's builder in place of its settings."""
     given = {key: value for key, value in stored.items() if key not in ("_target_", "_partial_")}
     has_cell = isinstance(given.get("cell"), Mapping)
     return given | ({"cell": _ours(run_dir, "cell", given["cell"])} if has_cell else {})

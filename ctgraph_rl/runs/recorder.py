@@ -178,7 +178,6 @@ class Recorder:
         return self._member.log
 
     def _open(self, run_dir: Path, overwrite: bool, resume: bool) -> None:
-        """Open the log of a new, resumed or finished run."""
         path = run_dir / LOG
         begun = RunLog.begun(path)
         stopped = begun is not None and not (run_dir / METRICS).exists()
@@ -219,7 +218,6 @@ class Recorder:
         )
 
     def _show(self, run_dir: Path) -> None:
-        """Read the log of a finished run."""
         self._member.log = RunLog.read(run_dir / LOG)
         changed = ", ".join(code_changes(self.log.of_kind("run")[0], self._member.about))
         fix = "choose another run_dir, or overwrite=True to run it again"
@@ -393,7 +391,6 @@ class Recorder:
         return by_slices([self._adapt(policy_for(ids[task])) for task in tasks])
 
     def _adapt(self, policy: Any) -> Policy:
-        """Return a policy as a function of TensorDicts."""
         return adapt(
             policy,
             greedy=self.curriculum.evaluation.greedy,

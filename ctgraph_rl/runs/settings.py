@@ -126,7 +126,6 @@ def _without(settings: ReadOnlyValues, added: ReadOnlyValues, prefix: str = "") 
 
 
 def _added_to(group: Any) -> NamedValues:
-    """Return the settings added to a group's target."""
     return ADDED.get(str(group.get("_target_")), {}) if isinstance(group, Mapping) else {}
 
 
@@ -206,7 +205,6 @@ def differences(stored: ReadOnlyValues, given: ReadOnlyValues) -> list[str]:
 
 
 def _value_before(key: str, given: ReadOnlyValues) -> Any:
-    """Return the value of a setting that was added later."""
     group, _, name = key.partition(".")
     return dict(flat(_added_to(given.get(group)))).get(name, ADDED.get("run", {}).get(key))
 
@@ -232,7 +230,6 @@ def _whole(number: re.Match[str]) -> str:
 
 
 def _defaults(name: str) -> Iterator[Any]:
-    """Yield a setting's values in the files of ``conf``."""
     group, _, key = name.rpartition(".")
     folder = Path(conf_dir(), group)
     for path in folder.glob("*.yaml") if group and folder.is_dir() else (Path(conf_dir(), "config.yaml"),):

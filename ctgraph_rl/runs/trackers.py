@@ -179,8 +179,6 @@ def mlflow_logger(folder: Path, uri: str | None, experiment: str) -> Logger:
 
 
 class _MLFlow(MLFlowLogger):
-    """TorchRL's logger with a run name; the run ends with it."""
-
     def __init__(self, folder: Path, uri: str | None, experiment: str) -> None:
         import mlflow
 
@@ -205,7 +203,6 @@ def trackio_logger(folder: Path, project: str) -> Logger:
 
 
 def _need(package: str) -> None:
-    """Check for a package, and set its environment before its import."""
     if find_spec(package) is None:
         raise ModuleNotFoundError(f"logger={package} needs {package}: pip install 'ctgraph_rl[{package}]'")
     for name, value in ENVIRONMENT.items():

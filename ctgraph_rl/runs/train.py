@@ -79,7 +79,6 @@ def _agent_rule(agent: object) -> Rule:
 
 
 def _takes_specs(make_agent: Callable[..., object]) -> Rule:
-    """The rule that a function takes the two specs."""
     try:
         signature(make_agent).bind(None, None)
         if isinstance(make_agent, type):

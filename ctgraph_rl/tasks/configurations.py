@@ -179,7 +179,6 @@ def make_task(task: Task | str | None = None, config: Json | None = None, **chan
 
 
 def _changed(task: Task, changes: NamedValues) -> Task:
-    """A task with other values of its fields, or of its graph's or observations'."""
     if "image_seed" in changes:
         require((task.image_seed is not None, f"image_seed needs generated images, got {task.images!r}"))
         changes["images"] = replace(task.images, seed=changes.pop("image_seed"))  # type: ignore[type-var]

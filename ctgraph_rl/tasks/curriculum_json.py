@@ -70,7 +70,6 @@ _CHOICES: dict[tuple[type, str], tuple[type, ...]] = {
 """Fields that hold one of several types, which JSON names."""
 
 _PARTS: dict[tuple[type, str], type] = {(Task, "graph"): CTGraph, (Task, "observations"): Observations}
-"""Fields that hold one type."""
 
 _OF_TASKS = ((Block, "tasks"), (Evaluation, "held_out"))
 _OF_ARGUMENTS = ((GymTask, "kwargs"), (GymTask, "wrappers"))
@@ -258,7 +257,6 @@ def _each(name: str, content: Any, read: Callable[[Any], Any]) -> list[Any]:
 
 
 def _built(kind: type, content: Any, tasks: Sequence[TaskLike] = ()) -> Any:
-    """Return an object of a class from its fields, with tasks by place."""
     added = [field.name for field in fields(kind) if field.metadata.get("added")]
     _check_keys(content, [name for name in _names(kind) if name not in added], added)
     arguments = {}

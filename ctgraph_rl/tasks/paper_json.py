@@ -131,7 +131,6 @@ def shown_ids(graph: CTGraph, found: ReadOnlyValues) -> Observations:
 
 
 def _next(ids: ReadOnlyValues) -> int:
-    """Return the id after all in use."""
     ranges = [as_tuple(each) for each in ids.values()]
     lasts = [last for each in ranges if isinstance(each, tuple) for last in each[-1:] if is_int(last)]
     return max([1, *lasts]) + 1

@@ -253,7 +253,6 @@ def _expressible(task: Task) -> list[Rule]:
 
 
 def _values(task: Task) -> NamedValues:
-    """A task by the keys of `_KEYS`."""
     x = task.observations
     images = task.images
     first, last = task.goal_change or (-1, -2)

@@ -279,7 +279,6 @@ class _EveryNode:
     task: Task
 
     def end_rewards(self) -> Tensor:
-        """float64 [b^d]."""
         task = self.task
         graph = task.graph
         leaf = torch.arange(graph.num_end_states, device="cpu")
@@ -310,7 +309,6 @@ class _GoalPath:
     task: Task
 
     def end_rewards(self) -> Tensor:
-        """float64 [2]."""
         return torch.tensor([self.task.goal_reward, 0.0], dtype=torch.float64, device="cpu")
 
     def children(self, values: Tensor, level: int) -> Tensor:
@@ -364,8 +362,6 @@ class _WorstActions(BestActions):
 
 @dataclass(frozen=True)
 class _Memoryless:
-    """Choices by the observation id."""
-
     task: Task
     gamma: float
     policy: Tensor

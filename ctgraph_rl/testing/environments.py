@@ -186,6 +186,5 @@ class EnvironmentContract(_OfTasks):
 def _assert_equal(
     step: TensorDictBase, other: TensorDictBase, following: TensorDictBase, other_following: TensorDictBase
 ) -> None:
-    """Assert that two steps and their next data are equal."""
     assert all(step["next", key].equal(other["next", key]) for key in (*SHOWN, "reward", "done"))
     assert all(following[key].equal(other_following[key]) for key in SHOWN)

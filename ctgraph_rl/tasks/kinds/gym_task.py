@@ -283,7 +283,6 @@ def _read_table(task: GymTask, key: Any) -> _Table:
 
 
 def _extreme_return(task: GymTask, choose: Callable[..., Any]) -> float:
-    """Return the best or worst possible return of an episode."""
     table = _table(task)
     impossible = table.probs == 0
     values = np.zeros(len(table.initial))
