@@ -48,6 +48,7 @@ class Attention(Cell):
     ) -> None:
         super().__init__(num_features, num_outputs, num_actions, **reads)
         self.num_frames = checked_frames(num_frames)
+        self.step_cost = 0.6 * num_frames  # each step computes the keys of all frames again
         require(*at_least_one(num_heads=num_heads))
         divided = f"hidden_size must be a multiple of num_heads={num_heads}, got {num_outputs}"
         require((num_outputs % num_heads == 0, divided))

@@ -47,6 +47,9 @@ class Cell(TakesNumbers, nn.Module):
     holds: ClassVar[str]
     """What it can hold, in a few words."""
 
+    step_cost: float = 1.0
+    """Time of a history in `over_tree`, relative to that of other cells."""
+
     def __init__(
         self,
         num_features: int,

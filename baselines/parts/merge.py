@@ -9,6 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
+from baselines.cells.cell import Cell
 from baselines.parts.networks import HISTORY, Data, Items, TensorsByName
 from ctgraph_rl.learn.histories import can_branch, distinct, renumber
 
@@ -16,7 +17,7 @@ FEWEST_FRAMES = 512
 """Frames of a minibatch up to which all are computed, as operations then cost more than frames."""
 
 LARGEST_SHARE = 0.6
-"""Share of different histories in a batch from which each frame is computed."""
+"""Share of different histories in a batch from which each frame is computed; of a cell, by its ``step_cost``."""
 
 KIND = "kind"
 """Key of frames' numbers, int64, the same for those that `merge` makes one."""
@@ -38,7 +39,9 @@ def number_frames(trunk: Any, items: Items, num_minibatches: int) -> Items:
         return {}
     numbers = trunk.number_histories(items)
     history = numbers[HISTORY]
-    if int(history.max()) >= LARGEST_SHARE * history.numel():
+    cells = [part for part in trunk.modules() if isinstance(part, Cell)]
+    share = LARGEST_SHARE / max([1.0, *(cell.step_cost for cell in cells)])
+    if int(history.max()) >= share * history.numel():
         return {}
     gains = items["advantage"].view_as(action) > 0
     taken = (history * (int(action.max()) + 1) + action) * 2 + gains

@@ -80,7 +80,8 @@ def update(learner: Trained, state: UpdateState, batch: Data) -> TensorsByName:
     """
     losses = losses_of(learner, state, batch)
     total = total_loss(losses)
-    gradients = torch.autograd.grad(total if state.tensors is None else total.sum(), state.weights)
+    value = total if state.tensors is None else total.sum()
+    gradients = torch.autograd.grad(value, state.weights, materialize_grads=True)  # 0 for what too few steps read
     norm = with_tensors(learner, state, _descend, state, gradients)
     return {**{key: value.detach() for key, value in losses.items()}, "grad_norm": norm}
 

@@ -22,6 +22,8 @@ from curricula.paper import ct_su_b1
 
 NUMBERS = (INPUT, HISTORY, KIND)
 
+LARGEST_SHARE = merging.LARGEST_SHARE
+
 ONE, TWO = ct_su_b1((1, 2)), ct_su_b1((2, 1))
 NOISY = replace(ONE, observations=replace(ONE.observations, read_noise=10))
 WAITS = replace(ONE, graph=replace(ONE.graph, wait_prob=0.5))
@@ -47,7 +49,7 @@ AGENTS = {
 def always(monkeypatch):
     """Small batches go over their histories, too."""
     monkeypatch.setattr(merging, "FEWEST_FRAMES", 0)
-    monkeypatch.setattr(merging, "LARGEST_SHARE", 2.0)
+    monkeypatch.setattr(merging, "LARGEST_SHARE", 100.0)
 
 
 def made(compose, name: str, kind: str, learn: int = 0) -> tuple:
@@ -131,6 +133,26 @@ def test_histories_round_at_most_three_times_as_much_as_all_frames(compose, name
     for correct, by_frames, by_histories in (vectors, (of_exact, of_plain, of_found)):
         most = 3 * (by_frames - correct).norm() + 4 * unit * correct.norm()
         assert (by_histories - correct).norm() <= most
+
+
+def test_attention_whose_steps_take_longer_goes_over_fewer_histories(compose, monkeypatch):
+    monkeypatch.setattr(merging, "LARGEST_SHARE", LARGEST_SHARE)
+
+    of_cells = {cell: made(compose, f"lstm_ppo {cell}", "cut episodes")[1] for cell in ("lstm", "attention")}
+
+    assert KIND in of_cells["lstm"]
+    assert KIND not in of_cells["attention"], "more than one history in num_frames = 32 frames"
+
+
+def test_a_step_that_no_later_one_follows_leaves_weights_of_later_ones_as_they_are(compose):
+    agent, minibatch = made(compose, "lstm_ppo backpropamine", "several tasks with ids")
+    before = deepcopy(agent.trunk.cell.modulator.weight)
+    first = {key: value[:, :1] for key, value in minibatch.items()}
+
+    agent.optimiser.state.clear()
+    agent.gradient_step(first)
+
+    assert torch.equal(agent.trunk.cell.modulator.weight, before)
 
 
 def test_a_critic_near_its_targets_is_not_lost_in_rounding():
