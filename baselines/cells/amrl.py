@@ -28,6 +28,7 @@ class AMRL(Cell):
             et al. 2024, arXiv 2403.03020); False: that of the maximum or the mean.
     """
 
+    merges_rows = True
     holds = "whether something was seen in an episode, for any time; and what its LSTM holds"
 
     def __init__(

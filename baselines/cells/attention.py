@@ -41,6 +41,7 @@ class Attention(Cell):
     """
 
     state_keys = ("recurrent_state_frames",)
+    merges_rows = True
     holds = "each of the last steps, by what was seen there"
 
     def __init__(

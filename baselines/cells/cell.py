@@ -44,6 +44,9 @@ class Cell(TakesNumbers, nn.Module):
     memory: ClassVar[bool] = True
     """Whether it holds anything of earlier steps."""
 
+    merges_rows: ClassVar[bool] = False
+    """Whether a step takes longer than finding the rows with the same history, so that it pays to act once for them."""
+
     holds: ClassVar[str]
     """What it can hold, in a few words."""
 

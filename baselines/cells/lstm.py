@@ -21,6 +21,7 @@ class LSTM(Cell):
     """An LSTM of one layer; arguments as in `Cell`."""
 
     state_keys = ("recurrent_state_h", "recurrent_state_c")
+    merges_rows = True
     holds = "what its gates let in, and the number of times that something was seen"
 
     def __init__(self, num_features: int, num_outputs: int, num_actions: int, **reads: bool) -> None:

@@ -56,7 +56,8 @@ def merged_outputs(policy: Any, trunk: Any, batch: Data) -> tuple[Data, TensorsB
     chosen, frames = merge(batch)
     features, histories = trunk.of_histories(batch)
     of_chosen = histories.index_select(0, chosen)
-    return frames, {key: value.index_select(0, of_chosen) for key, value in policy.heads(features).items()}
+    outputs = policy.heads(features)  # float64 from here on, so that the gradients of a history cancel in it
+    return frames, {key: value.double().index_select(0, of_chosen) for key, value in outputs.items()}
 
 
 def merge(batch: Data) -> tuple[Tensor, Items]:

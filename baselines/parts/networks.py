@@ -209,7 +209,7 @@ class RecurrentModule(TensorDictModuleBase):
         own = self._own(data)
         state = reset([data[key] for key in self.state_keys], data["is_init"].squeeze(-1))
         num_rows = len(seen[0])
-        if num_rows >= FEWEST_ROWS:
+        if num_rows >= FEWEST_ROWS and self.cell.merges_rows:
             examples, groups = distinct([*seen, *own, *state], most=MOST_ROWS)
             if len(examples) < num_rows:
                 seen = [value.index_select(0, examples) for value in seen]
