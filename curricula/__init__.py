@@ -84,6 +84,8 @@ def _function(name: str) -> Callable[..., Curriculum]:
     if name not in _named():
         near = nearest(str(name), names())
         hint = "ctgraph-rl curricula lists all" if near is None else f"did you mean {near!r}?"
+        if f"from_{name}" in _HOMES:
+            hint = f"it is made from settings: curricula.from_{name}(...)"
         raise ValueError(f"unknown curriculum {name!r}; {hint}")
     return _named()[name]
 

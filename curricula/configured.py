@@ -276,7 +276,9 @@ def _in_order(by_seed: Sequence[Tasks], goals: Any, num_goals: int, order: str, 
         read = [read_goal(goal) for goal in goals]
         are_goals = all(isinstance(goal, tuple) for goal in read)
         require((are_goals, f"goals must be one of {', '.join(GOALS)}, or a list such as [1.2,2.1], got {given!r}"))
-        rule = f"goals must have as many decisions as the depths, {sorted(depths)}, and some for each; got {given!r}"
+        example = ",".join(".".join("1" * depth) for depth in sorted(depths))
+        rule = f"goals must have as many decisions as the depths, {sorted(depths)}, and some for each; got {given!r}; "
+        rule += f"write them as [{example}]"
         require(({len(goal) for goal in read} == depths, rule))  # type: ignore[arg-type]
     with_goals = []
     for graphs in by_seed:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -72,7 +72,7 @@ def results(paths: Path | str | Sequence[Path | str]) -> pandas.DataFrame:
 
     Raises:
         ModuleNotFoundError: without pandas; names the extra to install.
-        ValueError: if no run is finished.
+        ValueError: if no run is finished, or for paths of another type.
 
     Example:
         >>> frame = results("runs")  # doctest: +SKIP
@@ -82,7 +82,12 @@ def results(paths: Path | str | Sequence[Path | str]) -> pandas.DataFrame:
     require_packages("results", "pandas")
     import pandas
 
-    runs, problems = find_runs([paths] if isinstance(paths, (str, Path)) else paths)
+    listed = [paths] if isinstance(paths, (str, Path)) else paths
+    rule = f"paths must be a folder of runs or a list of them, such as 'runs/ct8', got {paths!r}"
+    require((isinstance(listed, Iterable), rule))
+    listed = list(listed)
+    require((bool(listed) and all(isinstance(path, (str, Path)) for path in listed), rule))
+    runs, problems = find_runs(listed)
     finished = [run for run in runs if run.reason is None]
     unfinished = [f"{run.path}: {run.reason}" for run in runs if run.reason is not None]
     left_out = [*(problem.reason for problem in problems), *unfinished]

@@ -35,6 +35,10 @@ SAID = (
         "~{0}={2} removes {0} only where it is {2}, and it is {1}: leave ~{0}={2} out",
     ),
     (re.compile(r"Could not delete from config\. '(\S+)' does"), "~{0} removes what has no value: leave ~{0} out"),
+    (
+        re.compile(r"\[Errno 17\] File exists: '(.*)'"),
+        "{0} is a file, and a run needs a folder: give another hydra.run.dir",
+    ),
     (re.compile(r"Multiple values for (\S+)\. To override .*'override \S+: (.*)'"), "{0} has a value: write {0}={1}"),
 )
 """Beginnings of Hydra's messages, and their replacements."""

@@ -53,6 +53,8 @@ from ctgraph_rl.tasks.protocol import changed
 
 OF_AN_EXPERT = ("agent", "seed", "device", "num_threads", "portable")
 """Settings that an expert shares with its run."""
+FEW = 5
+"""Most settings that a refusal names."""
 
 
 ConfigAndPath = tuple[Any, Path]
@@ -424,7 +426,8 @@ def is_finished(cfg: DictConfig, run_dir: Path) -> bool:
     changed = differences(about.get("config") or {}, config.plain(cfg))
     if changed:
         advice = "choose another hydra.run.dir, or overwrite=true to replace it"
-        raise FileExistsError(f"{run_dir} holds a run with {', '.join(changed)}; {advice}")
+        more = f" and {len(changed) - FEW} more" if len(changed) > FEW else ""
+        raise FileExistsError(f"{run_dir} holds a run with {', '.join(changed[:FEW])}{more}; {advice}")
     stale, unknown = changed_code(cfg, run_dir, {})
     if stale and cfg.overwrite != config.STALE:
         raise FileExistsError(f"{run_dir} holds a run of other code: {', '.join(stale)} changed; {START_AGAIN}")

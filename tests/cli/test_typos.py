@@ -56,6 +56,16 @@ def test_a_setting_with_dashes_is_answered_with_how_it_is_written(monkeypatch, c
     assert said.endswith(f": a setting is written without dashes, {name}=VALUE; ctgraph-rl --help names the options")
 
 
+def test_a_file_where_a_run_needs_a_folder_is_named(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "graph.json").touch()
+
+    code = command_line(monkeypatch, "agent=ppo", "hydra.run.dir=graph.json")
+
+    said = "error: graph.json is a file, and a run needs a folder: give another hydra.run.dir\n"
+    assert (code, capsys.readouterr().err) == (1, said)
+
+
 def test_folders_that_hold_something_or_are_elsewhere_stay(monkeypatch, tmp_path):
     (tmp_path / "here" / "runs").mkdir(parents=True)
     (tmp_path / "here" / "runs" / "note.txt").touch()

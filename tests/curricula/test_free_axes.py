@@ -181,7 +181,11 @@ def test_a_graph_that_makes_no_curriculum_is_refused_with_the_rule(arguments, me
             {"goals": "some"},
             r"goals must be one of all, random, nested, or a list such as .1.2,2.1., got 'some'",
         ),
-        ({"goals": 3}, r"goals must have as many decisions as the depths, \[2\], and some for each; got 3"),
+        (
+            {"goals": 3},
+            r"goals must have as many decisions as the depths, \[2\], and some for each; got 3; write them as",
+        ),
+        ({"goals": [12], "depth": [2, 3]}, r"got \[12\]; write them as \[1.1,1.1.1\]"),
         ({"goals": [[1, 1, 1]]}, r"goals must have as many decisions as the depths, \[2\], and some for each"),
         ({"goals": [[1, 1]], "depth": [2, 3]}, r"goals must have as many decisions as the depths, \[2, 3\]"),
         ({"goals": [[1, 3]]}, r"goal must be 2 decisions in 1..2"),

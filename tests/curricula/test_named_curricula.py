@@ -139,6 +139,8 @@ def test_an_unknown_curriculum_is_refused_with_what_may_be_meant_or_where_all_ar
         curricula.load("su_b1_4task")
     with pytest.raises(ValueError, match=r"unknown curriculum 'xyz'; ctgraph-rl curricula lists all"):
         curricula.load("xyz")
+    with pytest.raises(ValueError, match=r"unknown curriculum 'axes'; it is made from settings: curricula.from_axes"):
+        curricula.load("axes", goals=["1.2"])
     with pytest.raises(ValueError, match="unknown curriculum 'xyz'"):
         curricula.summary("xyz")
 

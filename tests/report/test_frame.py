@@ -84,6 +84,13 @@ def test_what_is_left_out_is_said_and_without_a_finished_run_there_is_no_frame(t
     assert frame.seed.unique().tolist() == [0]
 
 
+@pytest.mark.parametrize("paths", [[], 3, None, [3]])
+def test_what_are_no_paths_is_refused_with_an_example(paths):
+    rule = f"paths must be a folder of runs or a list of them, such as 'runs/ct8', got {paths!r}"
+    with pytest.raises(ValueError, match=re.escape(rule)):
+        results(paths)
+
+
 def test_a_run_whose_log_is_broken_and_says_no_blocks_has_no_returns(tmp_path):
     path = make_run(tmp_path, 0, finished=False)
     about, *_ = RunLog.read(path / "run.jsonl").measurements
