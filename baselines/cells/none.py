@@ -6,6 +6,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from baselines.cells.cell import Cell, CellOutput, CellState, linear_layer, of_frames
+from ctgraph_rl.learn.histories import Tree
 
 
 class NoMemory(Cell):
@@ -25,3 +26,7 @@ class NoMemory(Cell):
     @override
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
         return of_frames(self.linear(inputs).relu(), groups)
+
+    @override
+    def over_tree(self, tree: Tree, inputs: Tensor, groups: Tensor, state: CellState) -> Tensor:
+        return self.linear(inputs).relu().index_select(0, groups)
