@@ -105,6 +105,6 @@ def test_readme_names_the_versions_of_python_of_the_package(checkout):
 
     versions = [each.split(" :: ")[-1] for each in project["classifiers"] if ":: Python :: 3." in each]
 
-    assert f"With Python {versions[0]} to {versions[-1]}." in readme
+    assert f"With Python {versions[0]} to {versions[-1]}, this installs" in readme
     assert f"![Python {versions[0]} to {versions[-1]}]({BADGE}{'%20%7C%20'.join(versions)}-blue)" in readme
     assert project["requires-python"] == f">={versions[0]}"

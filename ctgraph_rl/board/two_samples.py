@@ -123,12 +123,13 @@ def _p_values(submitted: np.ndarray, found: np.ndarray) -> np.ndarray:
 def _splits(count: int, found: int) -> np.ndarray:
     """Return who is in the last group, float64 [splits, count]: first the true split, then all or many random ones."""
     if math.comb(count, found) <= MOST_SPLITS:
-        chosen = [*combinations(range(count), found)][::-1]  # the true one is the last
+        chosen = np.array([*combinations(range(count), found)][::-1])  # the true one is the last
     else:
         rng = np.random.default_rng(0)
-        chosen = [range(count - found, count), *(rng.permutation(count)[:found] for _ in range(MOST_SPLITS - 1))]
+        drawn = [rng.permutation(count)[:found] for _ in range(MOST_SPLITS - 1)]
+        chosen = np.array([np.arange(count - found, count), *drawn])
     member = np.zeros((len(chosen), count))
-    np.put_along_axis(member, np.array(chosen), 1.0, axis=1)
+    np.put_along_axis(member, chosen, 1.0, axis=1)
     return member
 
 

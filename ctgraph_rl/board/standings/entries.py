@@ -18,7 +18,7 @@ from ctgraph_rl.disk import read_regular
 from ctgraph_rl.log.escape import listed
 from ctgraph_rl.report.bounds_of_runs import bounds_of_curriculum
 from ctgraph_rl.report.columns import board_columns
-from ctgraph_rl.report.intervals import within_bounds
+from ctgraph_rl.report.intervals import Bounds, within_bounds
 from ctgraph_rl.runs.read import Problem
 from ctgraph_rl.strict import files_below, json_value, one_line_of, too_deep
 
@@ -169,12 +169,12 @@ def make_entry(submission: Submission) -> BoardEntry:
     by_seed = {run.seed: scores_of(submission, run) for run in submission.finished}
     values = {}
     for metric in dict.fromkeys((track.score, *board_columns(submission.curriculum))):
-        low, high = bounds.of_metric(metric)
+        between = Bounds(*bounds.of_metric(metric))
         of_seeds = []
         for seed in track.seeds:
             value = by_seed.get(seed, {}).get(metric)
-            fits = value is None or (math.isfinite(value) and within_bounds([value], (low, high)))
-            require((fits, f"the logs give {metric} {value}, it must be in [{low:g}, {high:g}]"))
+            fits = value is None or (math.isfinite(value) and within_bounds([value], between))
+            require((fits, f"the logs give {metric} {value}, it must be in [{between.low:g}, {between.high:g}]"))
             of_seeds.append(value)
         values[metric] = tuple(of_seeds)
     return BoardEntry(
