@@ -155,6 +155,21 @@ def test_a_step_that_no_later_one_follows_leaves_weights_of_later_ones_as_they_a
     assert torch.equal(agent.trunk.cell.modulator.weight, before)
 
 
+def test_frames_of_one_history_and_action_with_other_old_log_probabilities_are_of_two_kinds(small_agent):
+    agent = small_agent("ppo", [ONE])
+    items = {
+        "observation": torch.zeros(2, 4, 12, 12, dtype=torch.uint8),
+        "action": torch.zeros(2, 4, dtype=torch.int64),
+        "action_log_prob": torch.tensor([[-1.0] * 4, [-1.0, -1.0, -1.0, -1.0000001]]),
+        "advantage": torch.ones(2, 4, 1),
+    }
+
+    numbers = merging.number_frames(agent.trunk, items, 1)
+
+    assert numbers[HISTORY].unique().tolist() == [0]
+    assert len(numbers[KIND].unique()) == 2 and (numbers[KIND] == numbers[KIND][1, 3]).sum() == 1
+
+
 def test_a_critic_near_its_targets_is_not_lost_in_rounding():
     generator = torch.Generator().manual_seed(0)
     target = (100 + 0.01 * torch.randn(4096, 1, generator=generator, dtype=torch.float64)).float()

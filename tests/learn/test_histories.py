@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from ctgraph_rl.learn import histories
 from ctgraph_rl.learn.histories import distinct, number_histories, renumber, tree
 
 ROWS, STEPS, INPUTS = 9, 7, 3
@@ -104,6 +105,13 @@ def test_of_many_rows_that_differ_as_with_noise_each_is_a_group():
 
     assert torch.equal(examples, groups) and torch.equal(groups, torch.arange(2048))
     assert len(distinct([values % 7])[0]) == 7
+
+
+def test_rows_that_differ_despite_equal_sums_are_of_different_groups(monkeypatch):
+    monkeypatch.setattr(histories, "_sums", lambda words: words[:, 0] * 0)
+
+    assert distinct([torch.tensor([[1], [2], [1]])])[1].tolist() == [0, 1, 2]
+    assert distinct([torch.tensor([[1], [1], [1]])])[1].tolist() == [0, 0, 0]
 
 
 def test_numbers_of_some_rows_are_numbered_again():
