@@ -337,3 +337,10 @@ def test_fine_tuning_takes_an_agent_that_is_no_learner(compose):
     agent = Scripted()
 
     assert made(compose, "method", "finetune")().attach(agent, CURRICULUM) is agent
+
+
+def test_no_more_items_are_samples_than_there_are_frames_asked_for():
+    samples = Samples(3)
+    samples.add({"action": torch.arange(8)})
+
+    assert len(list(samples.items())) == 3
