@@ -18,7 +18,7 @@ import curricula
 from baselines.parts.catalogue import catalogue
 from ctgraph_rl.packages import conf_dir
 from ctgraph_rl.run import ERRORS
-from ctgraph_rl.runs import config, job
+from ctgraph_rl.runs import config, explain, job
 
 SECONDS = 120
 """For one case; most take a hundredth of a second."""
@@ -129,7 +129,7 @@ def fault(cfg: DictConfig, name: str, value: Any) -> str | None:
             build(changed)
     except ERRORS as error:
         cause: BaseException = error
-        while cause.__cause__ is not None and not config._says_what_to_do(cause):
+        while cause.__cause__ is not None and not explain._says_what_to_do(cause):
             cause = cause.__cause__
         said = isinstance(cause, (ValueError, ImportError)) and str(cause) and "\n" not in str(cause).strip()
         return None if said else f"{case}: {type(cause).__name__}: {cause}"
