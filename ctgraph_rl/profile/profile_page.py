@@ -89,7 +89,10 @@ def draw_profiles(scores: Profiles) -> Any:
     height = 0.8 / len(shown)
     for position, (agent, of_agent) in enumerate(shown):
         look = agent_style(position, agent)
-        values, lows, highs = np.array([each[:3] for each in of_agent.values()], dtype=float).T  # None is not a number
+        found = np.array([each[:3] for each in of_agent.values()], dtype=float)  # None is not a number
+        values = found[:, 0]
+        lows = found[:, 1]
+        highs = found[:, 2]
         places = numbers + (position + 0.5) * height - 0.4
         bars.barh(places, values, height, color=look["color"], label=short(agent))
         bars.hlines(places, lows, highs, color="black", linewidth=0.8)

@@ -175,8 +175,8 @@ def test_eight_seeds_learn_from_what_each_would_alone_with_its_losses_and_gradie
         minibatches = list(group.first.minibatches_of(batch, group.seeds))
         for number in range(8):
             drawn = torch.cat([minibatch["advantage"][number].flatten() for minibatch in minibatches])
-            its = found["advantage"].chunk(8)[number].flatten()
-            assert torch.equal(drawn.sort().values, its.sort().values), "each of its own frames once"
+            own = found["advantage"].chunk(8)[number].flatten()
+            assert torch.equal(drawn.sort().values, own.sort().values), "a seed draws each frame of this seed once"
         compare(minibatches[0])
         return CapturedGroup.learn(group, batch)
 
