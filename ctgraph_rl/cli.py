@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -14,7 +15,6 @@ from typing import NamedTuple
 from ctgraph_rl import __version__, parsers
 from ctgraph_rl.checks import nearest
 from ctgraph_rl.log.escape import terminal_lines
-from ctgraph_rl.log.refuse import quiet_where_nobody_reads
 from ctgraph_rl.packages import check_packages, conf_dir
 
 
@@ -152,6 +152,28 @@ def first_imports() -> Iterator[None]:
             young, middle, _ = gc.get_threshold()
             gc.set_threshold(young, middle, FULL_COLLECTIONS)
             gc.enable()
+
+
+@contextmanager
+def quiet_where_nobody_reads() -> Iterator[None]:
+    """Exit quietly with code 1 once standard output has no reader, as in ``ctgraph-rl results | head``."""
+    try:
+        yield
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        if _has_reader():
+            raise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left has nowhere to go
+        sys.exit(1)
+
+
+def _has_reader() -> bool:
+    try:
+        print(flush=True)
+    except BrokenPipeError:
+        return False
+    return True
 
 
 def usage() -> str:

@@ -24,7 +24,7 @@ from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.core.tree import Swap, is_done
 from ctgraph_rl.draw.pixels import render
 from ctgraph_rl.tasks.kinds.gym_task import GymTask
-from ctgraph_rl.tasks.kinds.registry import ENVIRONMENTS
+from ctgraph_rl.tasks.kinds.task_like import ENVIRONMENTS
 from ctgraph_rl.tasks.switch import Switch
 from ctgraph_rl.tasks.task import Task
 

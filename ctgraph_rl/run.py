@@ -23,10 +23,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ctgraph_rl.checks import require
-from ctgraph_rl.cli import first_imports
+from ctgraph_rl.cli import first_imports, quiet_where_nobody_reads
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
 from ctgraph_rl.log.files import EX_TEMPFAIL, LOG
-from ctgraph_rl.log.refuse import quiet_where_nobody_reads
 from ctgraph_rl.packages import check_packages, conf_dir, makes_page
 from ctgraph_rl.portable import Restart, become_portable, restart
 from ctgraph_rl.runs.config import (

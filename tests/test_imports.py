@@ -95,3 +95,48 @@ def test_importing_a_module_changes_nothing_of_hydra_torch_numpy_gymnasium_and_w
     *changes, last = done.stdout.splitlines()
     assert changes == []
     assert int(last.split()[0]) > 250
+
+
+FILES = """
+import os
+import runpy
+import sys
+
+import torch.optim.adam
+
+import baselines
+import ctgraph_rl
+
+ROOTS = tuple(os.path.dirname(package.__file__) for package in (ctgraph_rl, baselines))
+ROOTS = (*ROOTS, os.path.join(os.path.dirname(ROOTS[1]), "curricula"))
+found = set()
+
+
+def count(frame, event, argument):
+    code = frame.f_code
+    is_function = code.co_flags & 1 and not code.co_name.endswith("comp>") and code.co_name != "<genexpr>"
+    if event == "call" and is_function and code.co_filename.startswith(ROOTS):
+        found.add(code.co_filename)
+
+
+def stop(*arguments, **settings):
+    sys.setprofile(None)
+    print("files:", len(found), *sorted(found), flush=True)
+    os._exit(0)
+
+
+torch.optim.adam.adam = stop
+sys.setprofile(count)
+runpy.run_module("ctgraph_rl.run", run_name="__main__", alter_sys=True)
+"""
+"""Prints the files in which a function runs before the first gradient step."""
+
+MOST_FILES = 75
+
+
+@pytest.mark.slow
+def test_a_run_reaches_its_first_gradient_step_through_few_files(tmp_path):
+    settings = ["curriculum=su_b1_4tasks", "curriculum.num_frames=2048", f"hydra.run.dir={tmp_path / 'run'}"]
+    done = subprocess.run([sys.executable, "-c", FILES, *settings], capture_output=True, text=True, cwd=tmp_path)
+    line = next(line for line in done.stdout.splitlines() if line.startswith("files:"))
+    assert int(line.split()[1]) <= MOST_FILES, line

@@ -13,9 +13,8 @@ from torch import Tensor
 from baselines.parts.networks import Data, Items, TensorsByName
 from baselines.update.compiled import compiled
 from baselines.update.measured import finite_means, table_of
-from baselines.update.step import take_step
 from baselines.update.trained import Trained
-from baselines.update.update import update
+from baselines.update.update import take_step, update
 from ctgraph_rl.checks import TakesNumbers, at_least_one, positive, require, true_or_false
 
 MOST_PASSES = 10**6  # over a batch, or gradient steps after it; more do not end

@@ -6,6 +6,7 @@ The step of PyTorch's Adam and RMSprop is a function of tensors, for every execu
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -14,9 +15,12 @@ from torch.func import functional_call, vmap
 from torch.optim.adam import adam
 from torch.optim.rmsprop import rmsprop
 
+from baselines.parts.hooks import Hooks
 from baselines.parts.networks import Data, TensorsByName
 from baselines.update.trained import Trained
+from ctgraph_rl.core.device import captures
 from ctgraph_rl.core.dynamics import beside
+from ctgraph_rl.core.region import Region
 
 OPTIMISERS = ("adam", "rmsprop")
 
@@ -271,3 +275,30 @@ def step(optimiser: Parts | torch.optim.Optimizer, gradients: Sequence[Tensor]) 
             centered=False,
             maximize=how["maximize"],
         )
+
+
+def take_step(learner: Trained, batch: Data) -> TensorsByName:
+    """Take a step; the first one and unusual sizes run `update` as written."""
+    if len(batch["action"]) != learner.minibatch_size or not learner.optimiser.state:
+        return update(learner, update_state(learner), batch)
+    if not is_captured(learner):
+        return usual_update(learner, batch)
+    learner.region = learner.region or Region(partial(usual_update, learner))
+    if not learner.region.takes(batch):
+        return update(learner, update_state(learner), batch)
+    return learner.region.copies(batch)
+
+
+def usual_update(learner: Trained, batch: Data) -> TensorsByName:
+    """Take the step, compiled where the agent is."""
+    return (learner.compiled_step or update)(learner, update_state(learner), batch)
+
+
+def update_state(learner: Trained) -> UpdateState:
+    """Return what an update of a learner changes."""
+    return UpdateState(learner.weights, parts_of(learner.optimiser), others=learner.other_weights())
+
+
+def is_captured(learner: Trained) -> bool:
+    """Return whether steps are CUDA graphs: on GPUs, without a method."""
+    return learner.capturable and type(learner.method) is Hooks and captures(next(learner.parameters()).device)

@@ -27,6 +27,11 @@ def checked_device(device: object) -> torch.device:
     return torch.device("cpu") if found is None or found.type == "cpu" else found
 
 
+def captures(device: torch.device | None) -> bool:
+    """Return whether a `Region` on a device is captured: on GPUs."""
+    return device is not None and device.type == "cuda"
+
+
 @contextmanager
 def torchs_defaults() -> Iterator[None]:
     """Give others' code that names no dtype and device float32 and the CPU, whatever the user's defaults."""

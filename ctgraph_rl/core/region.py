@@ -11,6 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ctgraph_rl.core.device import captures
+
 Tensors = Mapping[Any, Tensor]
 """Tensors by key."""
 
@@ -19,11 +21,6 @@ OwnTensors = dict[Any, Tensor]
 
 WARM_UP = 3
 """Calls before capture, which load kernels and make optimisers' state."""
-
-
-def captures(device: torch.device | None) -> bool:
-    """Return whether regions on a device are captured: on GPUs."""
-    return device is not None and device.type == "cuda"
 
 
 class Region:

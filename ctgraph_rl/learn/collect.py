@@ -14,8 +14,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ctgraph_rl.batch.specs import Specs, make_specs
 from ctgraph_rl.checks import Rule, at_least_one, is_int, require, takes_numbers
+from ctgraph_rl.core.device import captures
 from ctgraph_rl.core.dynamics import RowState, beside
-from ctgraph_rl.core.region import Region, captures
+from ctgraph_rl.core.region import Region
 from ctgraph_rl.core.row_params import RowParams
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.tasks.curriculum import Curriculum

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -20,7 +22,7 @@ from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.collect import InitialState, Policy, act, agent_specs, make_env, make_start
 from ctgraph_rl.learn.exact import exact_measures, shown_id
-from ctgraph_rl.learn.labels import task_policies
+from ctgraph_rl.learn.labels import task_labels
 from ctgraph_rl.learn.logits_policy import as_policy
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.metrics.adaptation import exact_search
@@ -287,3 +289,26 @@ def by_slices(policies: Sequence[Policy]) -> Policy:
         return torch.cat([policy(part) for policy, part in zip(policies, slices, strict=True)])
 
     return act
+
+
+def task_policies(
+    agent: Any, curriculum: Curriculum, log: RunLog, tasks: Iterable[TaskLike], frames: int | None = None
+) -> list[TensorDictModuleBase]:
+    """Return an agent's policy for each task: the one for its id where ids are shown, else one for all.
+
+    An agent that labels tasks has ``policy_for_label``, which gets the task's most frequent label.
+
+    Args:
+        tasks: what is played. An untrained one has no id and no label, and is played with `Agent.policy`.
+        frames: of the run so far, while it lasts. If the present task started after the log's last interval, it has the
+            label that acts.
+    """
+    if hasattr(agent, "policy_for_label"):
+        labels = task_labels(log, curriculum)
+        if frames:
+            for number in curriculum.trained[curriculum.block_at(frames) - 1]:
+                labels.setdefault(number, agent.label)
+        position = {task: number for number, task in enumerate(curriculum.tasks)}
+        return [agent.policy_for_label(labels.get(position[t])) if t in position else agent.policy for t in tasks]
+    ids = {} if curriculum.protocol.task_id == "hidden" else curriculum.task_ids
+    return [agent.policy_for(ids[task]) if task in ids else agent.policy for task in tasks]

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from typing import Any, NamedTuple
-
-from tensordict.nn import TensorDictModuleBase
+from typing import NamedTuple
 
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.metrics.labels import most_frequent
 from ctgraph_rl.tasks.curriculum import Curriculum
-from ctgraph_rl.tasks.kinds.task_like import TaskLike
 
 
 def task_labels(log: RunLog, curriculum: Curriculum) -> dict[int, int]:
@@ -52,26 +48,3 @@ def label_spans(log: RunLog) -> tuple[Span, ...]:
             own = own._replace(start=spans.pop().start)
         spans.append(own)
     return tuple(spans)
-
-
-def task_policies(
-    agent: Any, curriculum: Curriculum, log: RunLog, tasks: Iterable[TaskLike], frames: int | None = None
-) -> list[TensorDictModuleBase]:
-    """Return an agent's policy for each task: the one for its id where ids are shown, else one for all.
-
-    An agent that labels tasks has ``policy_for_label``, which gets the task's most frequent label.
-
-    Args:
-        tasks: what is played. An untrained one has no id and no label, and is played with `Agent.policy`.
-        frames: of the run so far, while it lasts. If the present task started after the log's last interval, it has the
-            label that acts.
-    """
-    if hasattr(agent, "policy_for_label"):
-        labels = task_labels(log, curriculum)
-        if frames:
-            for number in curriculum.trained[curriculum.block_at(frames) - 1]:
-                labels.setdefault(number, agent.label)
-        position = {task: number for number, task in enumerate(curriculum.tasks)}
-        return [agent.policy_for_label(labels.get(position[t])) if t in position else agent.policy for t in tasks]
-    ids = {} if curriculum.protocol.task_id == "hidden" else curriculum.task_ids
-    return [agent.policy_for(ids[task]) if task in ids else agent.policy for task in tasks]

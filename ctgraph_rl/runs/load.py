@@ -17,7 +17,7 @@ from tensordict.nn import TensorDictModuleBase
 from ctgraph_rl.agent import Agent, MethodLike
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, as_path, is_int, require
 from ctgraph_rl.core.device import checked_device
-from ctgraph_rl.learn.labels import task_policies
+from ctgraph_rl.learn.evaluate import task_policies
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG
 from ctgraph_rl.log.run_log import RunLog

@@ -29,10 +29,6 @@ _DIALECTS = ("2019", "2021", "2023")
 _GOAL_NEVER_CHANGES = ("2019",)  # the versions that read these files have no use for the numbers of episodes
 
 
-def _everywhere(section: str, key: str) -> tuple[str, str, str, str]:
-    return section, key, key, key
-
-
 _KEYS: dict[str, tuple[str, str | None, str | None, str | None]] = {  # section, and the key in each dialect
     "depth": ("graph_shape", "depth", "depth", "d"),
     "branching_factor": ("graph_shape", "branching_factor", "branching_factor", "b"),
@@ -41,17 +37,27 @@ _KEYS: dict[str, tuple[str, str | None, str | None, str | None]] = {  # section,
     "fail_reward": ("reward", "crash_reward_value", "crash_reward_value", "fail_r"),
     "is_stochastic": ("reward", "stochastic_sampling", "stochastic_sampling", None),
     "reward_std": ("reward", "reward_std", "reward_std", "std_r"),
-    "min_episodes": _everywhere("reward", "min_static_reward_episodes"),
-    "max_episodes": _everywhere("reward", "max_static_reward_episodes"),
-    "distribution": _everywhere("reward", "reward_distribution"),
+    "min_episodes": (
+        "reward",
+        "min_static_reward_episodes",
+        "min_static_reward_episodes",
+        "min_static_reward_episodes",
+    ),
+    "max_episodes": (
+        "reward",
+        "max_static_reward_episodes",
+        "max_static_reward_episodes",
+        "max_static_reward_episodes",
+    ),
+    "distribution": ("reward", "reward_distribution", "reward_distribution", "reward_distribution"),
     "unique_decisions": ("observations", "MDP_decisions", "MDP_decision_s", "MDP_D"),
     "unique_waits": ("observations", "MDP_delays", "MDP_wait_s", "MDP_W"),
     "wait_ids": ("observations", "delay_states", "wait_states", "W_IDs"),
     "decision_ids": ("observations", "decision_points", "decision_states", "D_IDs"),
-    "end_ids": _everywhere("observations", "graph_ends"),
-    "image_seed": _everywhere("image_dataset", "seed"),
-    "one_hot": _everywhere("image_dataset", "1D"),
-    "num_images": _everywhere("image_dataset", "nr_of_images"),
+    "end_ids": ("observations", "graph_ends", "graph_ends", "graph_ends"),
+    "image_seed": ("image_dataset", "seed", "seed", "seed"),
+    "one_hot": ("image_dataset", "1D", "1D", "1D"),
+    "num_images": ("image_dataset", "nr_of_images", "nr_of_images", "nr_of_images"),
     "noise": ("image_dataset", "noise_on_images_on_read", "noise_on_images_on_read", "noise_on_read"),
     "rotation": ("image_dataset", "small_rotation_on_read", "small_rotation_on_read", "rotation_on_read"),
 }

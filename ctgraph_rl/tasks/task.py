@@ -27,8 +27,7 @@ from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import Needle, RewardFn
 from ctgraph_rl.tasks import reference, values
 from ctgraph_rl.tasks.images import ImageSet, has_cue_element
-from ctgraph_rl.tasks.kinds.registry import environment
-from ctgraph_rl.tasks.kinds.task_like import TaskLike
+from ctgraph_rl.tasks.kinds.task_like import TaskLike, environment
 from ctgraph_rl.tasks.observations import Observations
 
 REWARDS = ("goal_reward", "fail_reward", "step_reward", "reward_std")

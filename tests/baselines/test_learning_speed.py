@@ -22,8 +22,7 @@ from baselines.cells.packed import Segments
 from baselines.update import seeds as together
 from baselines.update.compiled import compiler_options
 from baselines.update.seeds import SeedGroup
-from baselines.update.step import update_state
-from baselines.update.update import update
+from baselines.update.update import update, update_state
 from benchmarks import agents as benchmark
 from benchmarks import environment_ladder as ladder_of_envs
 from ctgraph_rl import CTGraphEnv

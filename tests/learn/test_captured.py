@@ -19,7 +19,7 @@ from helpers.small_agents import POLICY_GRADIENTS, SMALL_AGENT, agent_of, others
 from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-import baselines.update.step
+import baselines.update.update
 import curricula
 from baselines.parts.learner import Learner
 from baselines.update.captured import CapturedGroup
@@ -38,7 +38,7 @@ TINY = {"num_envs": 8, "num_steps": 4, "hidden_size": 8, "num_epochs": 1}
 @pytest.fixture
 def captured(monkeypatch) -> None:
     """Use regions on every device."""
-    for module in (collect, baselines.update.step):
+    for module in (collect, baselines.update.update):
         monkeypatch.setattr(module, "captures", lambda device: True)
 
 

@@ -21,8 +21,7 @@ from ctgraph_rl.checks import (
 )
 from ctgraph_rl.core.philox import STREAM_IMAGES, draw, randint
 from ctgraph_rl.core.rotation import rotate
-from ctgraph_rl.tasks.images.image_set import WHITE, SquareImages, resize
-from ctgraph_rl.tasks.images.measures import first_of_each
+from ctgraph_rl.tasks.images.image_set import WHITE, SquareImages, first_of_each, resize
 
 BLUEPRINT_SIZE = 4
 BLUEPRINT_LEVELS = (0, 127, WHITE)

@@ -83,3 +83,11 @@ def resize(images: Tensor, size: int) -> Tensor:
     block = side // size
     sums = images.view(-1, size, block, size, block).sum((2, 4), dtype=torch.int64)
     return ((2 * sums + block**2) // (2 * block**2)).to(torch.uint8)
+
+
+def first_of_each(images: Tensor) -> Tensor:
+    """Return the positions of images that repeat no earlier one, in order."""
+    _, group = torch.unique(images.flatten(1), dim=0, return_inverse=True)
+    positions = torch.arange(len(images), device="cpu")
+    none = torch.full_like(group[: int(group.max()) + 1], len(images))
+    return none.scatter_reduce(0, group, positions, reduce="amin").sort().values

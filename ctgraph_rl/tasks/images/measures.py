@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl.checks import require
-from ctgraph_rl.tasks.images.image_set import WHITE
+from ctgraph_rl.tasks.images.image_set import WHITE, first_of_each
 
 
 class Distances(NamedTuple):
@@ -63,11 +63,3 @@ def count_repeats(images: Tensor) -> int:
     fits = images.dtype == torch.uint8 and images.ndim == 3 and len(images) > 0
     require((fits, f"images must be uint8 [n, r, r] with n >= 1, got {images.dtype} {list(images.shape)}"))
     return len(images) - len(first_of_each(images))
-
-
-def first_of_each(images: Tensor) -> Tensor:
-    """Return the positions of images that repeat no earlier one, in order."""
-    _, group = torch.unique(images.flatten(1), dim=0, return_inverse=True)
-    positions = torch.arange(len(images), device="cpu")
-    none = torch.full_like(group[: int(group.max()) + 1], len(images))
-    return none.scatter_reduce(0, group, positions, reduce="amin").sort().values

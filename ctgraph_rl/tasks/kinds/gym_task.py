@@ -13,8 +13,7 @@ from ctgraph_rl.checks import as_tuple, is_int, is_real, make_fields_plain, requ
 from ctgraph_rl.packages import load_object
 from ctgraph_rl.tasks.kinds.frozen_arguments import by_name, thaw
 from ctgraph_rl.tasks.kinds.gym_spaces import ActionForm, ObservationForm
-from ctgraph_rl.tasks.kinds.registry import environment
-from ctgraph_rl.tasks.kinds.task_like import close_env
+from ctgraph_rl.tasks.kinds.task_like import close_env, environment
 
 if TYPE_CHECKING:
     import gymnasium

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any, Protocol
 
@@ -66,6 +66,9 @@ class TaskLike(Hashable, Protocol):
         """
         ...
 
+
+ENVIRONMENTS: dict[type, Callable[..., Any]] = {}
+"""Makers of environments by kind of task, filled by `ctgraph_rl.env`; they take `TaskLike.make_env`'s arguments."""
 
 MEMBERS = ("label_parts", "observation_shape", "num_actions", "make_env")
 
@@ -132,6 +135,17 @@ def require_tasks(values: Iterable[TaskLike]) -> tuple[Any, ...]:
     require((is_list, message))
     require(*are_tasks("tasks", tasks))
     return tuple(values)
+
+
+def environment(kind: type) -> Callable[..., Any]:
+    """Return the maker of environments for a kind of tasks.
+
+    Raises:
+        ImportError: if `ctgraph_rl.env` is not imported.
+    """
+    if kind not in ENVIRONMENTS:
+        raise ImportError(f"{kind.__name__}.make_env needs its environment: import ctgraph_rl.env first")
+    return ENVIRONMENTS[kind]
 
 
 def close_env(env: Any) -> None:

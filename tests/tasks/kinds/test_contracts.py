@@ -19,7 +19,7 @@ from baselines.methods.si import SI
 from ctgraph_rl import CTGraphEnv, Protocol, Task
 from ctgraph_rl.runs.config import target
 from ctgraph_rl.tasks.kinds.gym_task import GymTask
-from ctgraph_rl.tasks.kinds.registry import ENVIRONMENTS
+from ctgraph_rl.tasks.kinds.task_like import ENVIRONMENTS
 from ctgraph_rl.testing import AgentContract, EnvironmentContract, MethodContract, TaskContract
 from curricula.paper import ct_su_b1
 
