@@ -50,6 +50,10 @@ REFUSED = [
     (["experts_dir=null"], ["experts_dir must be the path of a folder, got None"]),
     (["evaluation=null"], ["evaluation must have keys, such as evaluation.every=5120, got None"]),
     (
+        ["evaluation.exact=true", "evaluation.num_episodes=5"],
+        ["error: evaluation.exact=true plays no episodes, got evaluation.num_episodes=5: leave it out\n"],
+    ),
+    (
         ["protocol.task_id=shown"],
         ["error: protocol.task_id must be one of hidden, one_hot, at_boundaries, got 'shown'\n"],
     ),

@@ -113,18 +113,19 @@ def exact_value(policy: ActionProbs | nn.Module, task: Task, gamma: float = 1.0)
     return _measure_function(policy, task, gamma).return_mean
 
 
-def exact_rules(policy: object, task: TaskLike, start: Step) -> Iterator[Rule]:
+def exact_rules(policy: object, task: TaskLike, start: Step, name: str | None = None) -> Iterator[Rule]:
     """Yield what exact measures require of a policy and a task.
 
     Args:
         start: the recurrent state before an episode, of one row; empty without memory.
+        name: in messages; None: the policy's class.
     """
     episodes = "set evaluation.exact=false, which plays episodes"
     kind = type(task).__name__
     yield isinstance(task, Task), f"exact evaluation needs CT-graphs, got {kind}: {episodes}"
     if not isinstance(task, Task):
         return
-    name = type(policy).__name__
+    name = type(policy).__name__ if name is None else name
     has_probs = hasattr(policy, "action_probs")
     yield has_probs, f"exact evaluation needs a policy with action_probs, which {name} has not: {episodes}"
     lasts = f"exact evaluation needs episodes that do not depend on earlier ones, as those of {name} do: {episodes}"
@@ -175,7 +176,10 @@ def _num_views(task: Task) -> int:
 
 
 def _measure_function(policy: ActionProbs | nn.Module, task: Task, gamma: float) -> Measures:
-    require((are_graphs([task]), f"exact values are those of CT-graphs, got {type(task).__name__}"))
+    require(
+        (callable(policy), f"policy must be a function of images or a module, got {policy!r}"),
+        (are_graphs([task]), f"exact values are those of CT-graphs, got {type(task).__name__}"),
+    )
     acts = as_policy(policy, task.num_actions) if isinstance(policy, nn.Module) else _Function(policy, task.num_actions)
     return exact_measures(acts, task, greedy=False, gamma=gamma)
 

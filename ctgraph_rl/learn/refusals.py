@@ -69,17 +69,14 @@ def check_exact(curriculum: Curriculum, agent: Agent) -> None:
     """Refuse exact evaluation of an agent, or on a task, that has no exact measures.
 
     Raises:
-        ValueError: names the reason and the setting to use.
+        ValueError: names the first reason and the setting to use.
     """
     if not curriculum.evaluation.exact:
         return
     start = dict(agent.initial_state(1).items())
-    rules: dict[str, Rule] = {}
     for task in (*curriculum.tasks, *curriculum.evaluation.held_out):
-        for holds, message in exact_rules(agent.policy, task, start):
-            if not holds:
-                rules[message] = (holds, message)
-    require(*rules.values())
+        for rule in exact_rules(agent.policy, task, start, type(agent).__name__):
+            require(rule)
 
 
 def check_adaptation(curriculum: Curriculum, agent: Agent) -> None:

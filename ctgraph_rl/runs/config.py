@@ -203,6 +203,12 @@ def check_settings(cfg: DictConfig) -> None:
     require((isinstance(folder, str) and bool(folder), f"experts_dir must be the path of a folder, got {folder!r}"))
     for switch in ("experts", "report", "portable", "together"):
         require((isinstance(cfg[switch], bool), f"{switch} must be true or false, got {cfg[switch]!r}"))
+    evaluation = cfg.evaluation if isinstance(cfg.evaluation, DictConfig) else {}
+    if evaluation.get("exact") is True:
+        for name in ("num_episodes", "episodes_per_row"):
+            given = evaluation.get(name)
+            rule = f"evaluation.exact=true plays no episodes, got evaluation.{name}={given}: leave it out"
+            require((given is None, rule))
     require(
         check_overwrite(cfg.overwrite),
         *one_of(RESUME, resume=cfg.resume),

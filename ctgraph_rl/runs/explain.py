@@ -17,6 +17,7 @@ from ctgraph_rl.packages import conf_dir
 from ctgraph_rl.runs.settings import as_typed, flat
 
 SAID = (
+    (re.compile(r"Ambiguous value for argument '\+?seeds=(.*)'"), "seeds={0} is no setting: give -m seed={0}"),
     (
         re.compile(r"Ambiguous value for argument '(.*)'"),
         "{0} has several values: add -m to run each; a list is written in brackets, a text in quotes",

@@ -385,7 +385,7 @@ def run_seeds(cfg: Any, run_dir: Path) -> list[Path]:
         ValueError: before any work, for a value out of range.
         RuntimeError: if seeds have failed.
     """
-    alone = "seeds is a setting of the jobs of a sweep: add -m, and give seed=0,1 in place of it"
+    alone = "a sweep's seeds are given as seed=0,1 or seed=range(2), with -m, got seeds"
     require((config.in_sweep(), alone))
     seeds = cfg.seeds
     are_seeds = isinstance(seeds, Sequence) and all(map(is_int, seeds)) and len({*seeds}) == len(seeds) > 0

@@ -121,10 +121,11 @@ class Sweeper(Base):
         assert self.config is not None
         overwrite = self.config.overwrite
         together = self.config.together
+        seeds = [setting for setting in arguments if setting.lstrip("+").startswith("seeds=")]
         require(
             check_overwrite(overwrite),
             (isinstance(together, bool), f"together must be true or false, got {together!r}"),
-            ("seeds" not in self.config, "seeds is a setting of the jobs of a sweep: give seed=0,1 in place of it"),
+            (not seeds, f"a sweep's seeds are given as seed=0,1 or seed=range(2), got {' '.join(seeds)}"),
         )
         if self.config.portable is True:
             become_portable()  # processes that a launcher starts have its variables

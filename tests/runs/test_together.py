@@ -335,8 +335,11 @@ def test_a_seed_that_failed_has_failed_also_where_its_group_was_stopped_before_i
             "as one batch: add -m and several seeds, such as seed=range(20), or together=false for one run",
         ),
         (("-m", "seed=0,1", "together=[0,1]"), "together must be true or false, got [0, 1]"),
-        (("-m", "+seeds=[0,1]"), "seeds is a setting of the jobs of a sweep: give seed=0,1"),
-        (("+seeds=[0,1]",), "seeds is a setting of the jobs of a sweep: add -m, and give seed=0,1"),
+        (("-m", "+seeds=[0,1]"), "a sweep's seeds are given as seed=0,1 or seed=range(2), got +seeds=[0,1]"),
+        (("-m", "+seeds=0,1"), "a sweep's seeds are given as seed=0,1 or seed=range(2), got +seeds=0,1"),
+        (("-m", "seeds=0,1"), "a sweep's seeds are given as seed=0,1 or seed=range(2), got seeds=0,1"),
+        (("seeds=0,1",), "seeds=0,1 is no setting: give -m seed=0,1"),
+        (("+seeds=[0,1]",), "a sweep's seeds are given as seed=0,1 or seed=range(2), with -m, got seeds"),
     ],
 )
 def test_other_uses_are_refused(monkeypatch, capsys, arguments, message):
