@@ -102,7 +102,7 @@ import os
 import runpy
 import sys
 
-import torch.optim.adam
+import torch.optim.adam as steps
 
 import baselines
 import ctgraph_rl
@@ -125,7 +125,8 @@ def stop(*arguments, **settings):
     os._exit(0)
 
 
-torch.optim.adam.adam = stop
+steps.adam = stop
+sys.argv[0] = "run"
 sys.setprofile(count)
 runpy.run_module("ctgraph_rl.run", run_name="__main__", alter_sys=True)
 """
@@ -138,5 +139,5 @@ MOST_FILES = 75
 def test_a_run_reaches_its_first_gradient_step_through_few_files(tmp_path):
     settings = ["curriculum=su_b1_4tasks", "curriculum.num_frames=2048", f"hydra.run.dir={tmp_path / 'run'}"]
     done = subprocess.run([sys.executable, "-c", FILES, *settings], capture_output=True, text=True, cwd=tmp_path)
-    line = next(line for line in done.stdout.splitlines() if line.startswith("files:"))
+    line = next((line for line in done.stdout.splitlines() if line.startswith("files:")), done.stderr)
     assert int(line.split()[1]) <= MOST_FILES, line
