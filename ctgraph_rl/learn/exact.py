@@ -72,7 +72,7 @@ def exact_measures(
     start = {} if initial_state is None else dict(initial_state(1).items())
     require(*exact_rules(policy, task, start))
     assert isinstance(task, Task)  # as the rules say
-    shown = _Shown(task, tuple(task.observation_shape if shape is None else shape), task_id)
+    shown = ShownTask(task, tuple(task.observation_shape if shape is None else shape), task_id)
     exploration = ExplorationType.DETERMINISTIC if greedy else ExplorationType.RANDOM
     with set_exploration_type(exploration):
         if not start:
@@ -201,7 +201,7 @@ class _Function:
 
 
 @dataclass(frozen=True)
-class _Shown:
+class ShownTask:
     """What a policy reads of a task.
 
     Args:
@@ -233,7 +233,7 @@ class _Shown:
         return data
 
 
-def _table(policy: Any, task: Task, shown: _Shown) -> Tensor:
+def _table(policy: Any, task: Task, shown: ShownTask) -> Tensor:
     """Return action probabilities, float64 [num_images, A]: means over the views of an id.
 
     Those of ids that decide nothing are equal.
@@ -272,7 +272,7 @@ class _Histories:
 class _Enumeration:
     """All histories of a policy with memory, played depth first in parts of `HISTORIES_AT_ONCE`."""
 
-    def __init__(self, policy: Any, task: Task, shown: _Shown, gamma: float) -> None:
+    def __init__(self, policy: Any, task: Task, shown: ShownTask, gamma: float) -> None:
         self.policy = policy
         self.task = task
         self.shown = shown
