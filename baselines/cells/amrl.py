@@ -7,10 +7,10 @@ Beck et al. 2020 (ICLR, Aggregated Memory for Reinforcement Learning): m_t = max
 from __future__ import annotations
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from typing_extensions import override
 
-from baselines.cells.cell import Cell, CellOutput, CellState, linear_layer, zeros_like_weights
+from baselines.cells.cell import Cell, CellOutput, CellState, Units, linear_layer, zeros_like_weights
 from baselines.cells.lstm import LSTM
 from baselines.cells.scan import linear_scan, max_scan
 from ctgraph_rl.checks import one_of, require, true_or_false
@@ -49,6 +49,7 @@ class AMRL(Cell):
         )
         self.inner = LSTM(num_features, num_outputs, num_actions, **reads)
         self.linear = linear_layer(num_outputs, num_outputs)
+        self.relu = nn.ReLU()
         self.is_max = aggregator == "max"
         self.straight_through = straight_through
         own = ("recurrent_state_max",) if self.is_max else ("recurrent_state_sum", "recurrent_state_count")
@@ -59,6 +60,14 @@ class AMRL(Cell):
         aggregated = zeros_like_weights(self, num_rows, self.num_outputs // 2)
         zeros = (*self.inner.zeros(num_rows), aggregated)
         return zeros if self.is_max else (*zeros, zeros_like_weights(self, num_rows, 1))
+
+    @override
+    def input_layers(self) -> list[tuple[Tensor, Tensor]]:
+        return self.inner.input_layers()
+
+    @override
+    def hidden_layers(self) -> list[Units]:
+        return [Units("cell", self.linear, self.relu)]
 
     @override
     def step(self, inputs: Tensor, state: CellState) -> CellOutput:
@@ -92,7 +101,7 @@ class AMRL(Cell):
         return m, tuple(value[:, -1] for value in after)
 
     def _output(self, m: Tensor, y: Tensor) -> Tensor:
-        return self.linear(torch.cat([y, m], dim=-1)).relu()
+        return self.relu(self.linear(torch.cat([y, m], dim=-1)))
 
 
 def _sums(inputs: Tensor, starts: Tensor, state: Tensor) -> Tensor:

@@ -21,6 +21,7 @@ from baselines.cells.cell import (
     Cell,
     CellOutput,
     CellState,
+    Units,
     linear_layer,
     number_episodes,
     of_frames,
@@ -58,6 +59,7 @@ class Attention(Cell):
         self.attended = linear_layer(num_outputs, 3 * num_outputs)
         self.leave = linear_layer(num_outputs, num_outputs)
         self.wider = linear_layer(num_outputs, 2 * num_outputs)
+        self.relu = nn.ReLU()
         self.narrower = linear_layer(2 * num_outputs, num_outputs)
         self.first_norm = nn.LayerNorm(num_outputs, dtype=torch.float32, device="cpu")
         self.second_norm = nn.LayerNorm(num_outputs, dtype=torch.float32, device="cpu")
@@ -72,6 +74,14 @@ class Attention(Cell):
     def zeros(self, num_rows: int) -> CellState:
         """Return zeros for earlier inputs, [num_rows, num_frames - 1, num_inputs + 1], oldest first."""
         return (zeros_like_weights(self, num_rows, self.num_frames - 1, self.num_inputs + 1),)
+
+    @override
+    def input_layers(self) -> list[tuple[Tensor, Tensor]]:
+        return [(self.enter.weight, self.enter.bias)]
+
+    @override
+    def hidden_layers(self) -> list[Units]:
+        return [Units("wider", self.wider, self.relu, self.narrower)]
 
     @override
     def step(self, inputs: Tensor, state: CellState) -> CellOutput:
@@ -114,7 +124,7 @@ class Attention(Cell):
         shares = scores.masked_fill(hidden, -torch.inf).softmax(dim=-1)
         a = (shares @ v).transpose(1, 2).flatten(2)
         y = x[:, -num_steps:] + self.leave(a)
-        wide = self.wider(self.second_norm(y)).relu()
+        wide = self.relu(self.wider(self.second_norm(y)))
         return self.last_norm(y + self.narrower(wide))
 
     def _by_head(self, values: Tensor) -> Tensor:

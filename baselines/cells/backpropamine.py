@@ -77,6 +77,10 @@ class Backpropamine(Cell):
         return (units, *matrices)
 
     @override
+    def input_layers(self) -> list[tuple[Tensor, Tensor]]:
+        return [(self.input.weight, self.input.bias)]
+
+    @override
     def step(self, inputs: Tensor, state: CellState) -> CellOutput:
         return self._step(self.input(inputs), state)
 

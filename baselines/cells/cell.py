@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -21,6 +21,20 @@ CellOutput = tuple[Tensor, CellState]
 
 REWARD = "reward"
 """Key of an agent's last reward."""
+
+
+class Units(NamedTuple):
+    """A hidden layer's units, without what reads them."""
+
+    name: str
+    linear: nn.Linear
+    """Its incoming weights, [units, inputs], and biases."""
+
+    activation: nn.Module
+    """What writes the units, [..., units]: a ReLU, or one behind a layer norm."""
+
+    reader: nn.Linear | None = None
+    """What reads the units; None: the next layer, or the heads."""
 
 
 class Cell(TakesNumbers, nn.Module):
@@ -67,6 +81,14 @@ class Cell(TakesNumbers, nn.Module):
         self.num_inputs = num_features + num_actions * reads_action + reads_reward
         self.num_outputs = num_outputs
         self.num_actions = num_actions
+
+    def input_layers(self) -> list[tuple[Tensor, Tensor]]:
+        """Return weights, [n, inputs], and biases, [n], of the layers that read the inputs, of one or several steps."""
+        raise NotImplementedError
+
+    def hidden_layers(self) -> list[Units]:
+        """Return the layers with ReLU; units without a ``reader`` are the cell's outputs."""
+        return []
 
     def zeros(self, num_rows: int) -> CellState:
         """Return the zero state at the start of an episode, here [num_rows, num_outputs] of each key."""

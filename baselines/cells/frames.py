@@ -6,13 +6,14 @@ As in Mnih et al. 2015 (arXiv 1312.5602), which stacks the images themselves.
 from __future__ import annotations
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from typing_extensions import override
 
 from baselines.cells.cell import (
     Cell,
     CellOutput,
     CellState,
+    Units,
     linear_layer,
     number_episodes,
     of_frames,
@@ -49,15 +50,24 @@ class Frames(Cell):
         super().__init__(num_features, num_outputs, num_actions, **reads)
         self.num_frames = checked_frames(num_frames)
         self.linear = linear_layer(num_frames * self.num_inputs, num_outputs)
+        self.relu = nn.ReLU()
 
     def zeros(self, num_rows: int) -> CellState:
         """Return zeros for earlier inputs, [num_rows, num_frames - 1, num_inputs], oldest first."""
         return (zeros_like_weights(self, num_rows, self.num_frames - 1, self.num_inputs),)
 
     @override
+    def input_layers(self) -> list[tuple[Tensor, Tensor]]:
+        return [(self.linear.weight, self.linear.bias)]
+
+    @override
+    def hidden_layers(self) -> list[Units]:
+        return [Units("cell", self.linear, self.relu)]
+
+    @override
     def step(self, inputs: Tensor, state: CellState) -> CellOutput:
         window = torch.cat([state[0], inputs.unsqueeze(1)], dim=1)
-        return self.linear(window.flatten(1)).relu(), (window[:, 1:],)
+        return self.relu(self.linear(window.flatten(1))), (window[:, 1:],)
 
     @override
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
@@ -69,4 +79,4 @@ class Frames(Cell):
         windows = frames.unfold(1, self.num_frames, 1).transpose(2, 3)
         same = of_frame.unfold(1, self.num_frames, 1) == episode.unsqueeze(-1)
         seen = windows * same.unsqueeze(-1)
-        return self.linear(seen.flatten(2)).relu()
+        return self.relu(self.linear(seen.flatten(2)))

@@ -29,6 +29,10 @@ class GRU(Cell):
         self.gru = nn.GRU(self.num_inputs, num_outputs, batch_first=True, dtype=torch.float32, device="cpu")
 
     @override
+    def input_layers(self) -> list[tuple[Tensor, Tensor]]:
+        return [(self.gru.weight_ih_l0, self.gru.bias_ih_l0)]
+
+    @override
     def step(self, inputs: Tensor, state: CellState) -> CellOutput:
         if is_traced():  # PyTorch's own cannot be vectorised over seeds
             after = gru_step(self.gru, gru_inputs(self.gru, inputs), state[0])

@@ -33,6 +33,10 @@ class LSTM(Cell):
         return tuple(zeros_like_weights(self, num_rows, 1, self.num_outputs) for _ in self.state_keys)
 
     @override
+    def input_layers(self) -> list[tuple[Tensor, Tensor]]:
+        return [(self.lstm.weight_ih_l0, self.lstm.bias_ih_l0)]
+
+    @override
     def step(self, inputs: Tensor, state: CellState) -> CellOutput:
         given = lstm_inputs(self.lstm, inputs)
         h, c = lstm_step(self.lstm, given, state[0].squeeze(1), state[1].squeeze(1))

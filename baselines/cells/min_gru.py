@@ -25,6 +25,10 @@ class MinGRU(Cell):
         self.candidate = linear_layer(self.num_inputs, num_outputs)
 
     @override
+    def input_layers(self) -> list[tuple[Tensor, Tensor]]:
+        return [(self.gate.weight, self.gate.bias), (self.candidate.weight, self.candidate.bias)]
+
+    @override
     def step(self, inputs: Tensor, state: CellState) -> CellOutput:
         carry, given = self._parts(inputs)
         output = carry * state[0] + given

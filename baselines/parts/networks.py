@@ -15,7 +15,7 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import ProbabilisticActor, ValueOperator, recurrent_mode
 
-from baselines.cells.cell import REWARD, Cell, CellState, MakeCell, linear_layer, reset
+from baselines.cells.cell import REWARD, Cell, CellState, MakeCell, Units, linear_layer, reset
 from ctgraph_rl.batch.specs import TASK_NUMBER
 from ctgraph_rl.checks import one_of, require, require_memory
 from ctgraph_rl.learn import histories
@@ -67,6 +67,8 @@ class Convolutions(nn.Module):
         self.shape = shape
         self.first = linear_layer(shape[0] * TILE**2, NUM_CHANNELS)
         self.second = linear_layer(9 * NUM_CHANNELS, NUM_CHANNELS)
+        self.first_relu = nn.ReLU()
+        self.second_relu = nn.ReLU()
         self.num_features = NUM_CHANNELS * shape[1:].numel() // TILE**2
 
     def forward(self, flat: Tensor) -> Tensor:
@@ -74,12 +76,12 @@ class Convolutions(nn.Module):
         channels, rows, columns = self.shape
         tiled = flat.unflatten(-1, (channels, rows // TILE, TILE, columns // TILE, TILE))
         tiles = tiled.movedim((-4, -2), (-5, -4)).flatten(-3)
-        found = nn.functional.pad(self.first(tiles).relu(), (0, 0, 1, 1, 1, 1))
+        found = nn.functional.pad(self.first_relu(self.first(tiles)), (0, 0, 1, 1, 1, 1))
         patches = []
         for i in range(3):
             for j in range(3):
                 patches.append(found[..., i : i + rows // TILE, j : j + columns // TILE, :])
-        return self.second(torch.cat(patches, dim=-1)).relu().flatten(-3)
+        return self.second_relu(self.second(torch.cat(patches, dim=-1))).flatten(-3)
 
 
 class Encoder(nn.Module):
@@ -114,9 +116,21 @@ class Encoder(nn.Module):
         self.num_inputs = num_inputs
         self.num_ids = num_ids
         self.linear = linear_layer(num_inputs + num_ids + num_extra, num_features)
+        self.relu = nn.ReLU()
         self.further = nn.Sequential()
         for _ in range(num_layers - 1):
             self.further.extend([linear_layer(num_features, num_features), nn.ReLU()])
+
+    def hidden_layers(self) -> list[Units]:
+        """Return its layers; the units of a convolution are its channels."""
+        found = []
+        if self.convolutions is not None:
+            found.append(Units("convolution.1", self.convolutions.first, self.convolutions.first_relu))
+            found.append(Units("convolution.2", self.convolutions.second, self.convolutions.second_relu))
+        found.append(Units("encoder.1", self.linear, self.relu))
+        for number in range(0, len(self.further), 2):
+            found.append(Units(f"encoder.{number // 2 + 2}", self.further[number], self.further[number + 1]))
+        return found
 
     def forward(self, observation: Tensor, *extra: Tensor) -> Tensor:
         """Map uint8 [..., *shape], a task's number where ids are read, and further inputs to features.
@@ -135,7 +149,7 @@ class Encoder(nn.Module):
         others = [values.to(dtype) for values in extra[bool(self.num_ids) :]]
         inputs = joined(inputs, *others)
         if not self.num_ids:
-            return self.further(self.linear(inputs).relu())
+            return self.further(self.relu(self.linear(inputs)))
         of_inputs, of_ids, of_others = self.linear.weight.tensor_split(
             [self.num_inputs, self.num_inputs + self.num_ids], dim=1
         )
@@ -143,7 +157,7 @@ class Encoder(nn.Module):
         number = extra[0].squeeze(-1)
         of_number = of_ids.t().index_select(0, number.clamp(min=0).flatten()).unflatten(0, number.shape)
         hidden = nn.functional.linear(inputs, weight, self.linear.bias) + of_number * (extra[0] >= 0)
-        return self.further(hidden.relu())
+        return self.further(self.relu(hidden))
 
 
 class EncoderModule(TensorDictModule):
@@ -245,6 +259,13 @@ class RecurrentModule(TensorDictModuleBase):
         inputs = groups.view_as(starts)
         state = [data[key][:, 0] for key in self.state_keys]
         return {INPUT: inputs, HISTORY: histories.number_histories(inputs, starts, state)}
+
+    def input_groups(self, data: Data) -> Tensor:
+        """Return the number of each frame's inputs, of which the encoder reads different ones once, [rows * steps]."""
+        if INPUT in data:
+            return renumber(data[INPUT].flatten())[1]
+        seen, own = self._read(data)
+        return distinct([*seen, *own])[1]
 
     def _read(self, data: Data) -> tuple[list[Tensor], list[Tensor]]:
         """Return what the encoder reads at all frames, [rows * steps, ...] each, and the cell's other inputs."""
