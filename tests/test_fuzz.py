@@ -39,6 +39,7 @@ from ctgraph_rl.gym import CTGraphGymEnv, CTGraphVectorEnv
 from ctgraph_rl.log.export import write_l2logger
 from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG, METRICS
 from ctgraph_rl.log.scores import scores
+from ctgraph_rl.log.sums import is_complete
 from ctgraph_rl.log.tables import write_tables
 from ctgraph_rl.policies import OptimalPolicy
 from ctgraph_rl.report import formats, results
@@ -344,7 +345,7 @@ def file_case(draw: random.Random, folder: Path, _: Any) -> tuple[str, str | Non
             lambda: formats.text(results.table(find_runs([run])[0])),
             lambda: load(run),
         ],
-        METRICS: [lambda: formats.text(results.table(find_runs([run])[0]))],
+        METRICS: [lambda: formats.text(results.table(find_runs([run])[0])), lambda: is_complete(run)],
         AGENT: [lambda: load(run)],
         "task.json": [lambda: Task.from_json(run / "task.json", (1, 1))],
     }[name]

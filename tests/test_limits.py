@@ -21,7 +21,7 @@ import curricula
 from ctgraph_rl import Curriculum, RunLog, Task, strict
 from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.saved import read_plain
-from ctgraph_rl.log.sums import write_sums
+from ctgraph_rl.log.sums import sums_of, write_metrics
 from ctgraph_rl.log.tables import write_tables
 from ctgraph_rl.runs.checkpoints import BrokenCheckpoint, decoded
 from ctgraph_rl.runs.read import find_runs
@@ -227,7 +227,7 @@ def test_no_reader_opens_a_pipe_or_a_device(tmp_path, make):
 
 
 @pytest.mark.parametrize("make", SPECIAL.values(), ids=SPECIAL)
-@pytest.mark.parametrize("name", ["sums.json", "curriculum.json", "agent.pt", "performance.csv", "metrics.json"])
+@pytest.mark.parametrize("name", ["curriculum.json", "agent.pt", "metrics.json"])
 def test_no_pipe_or_device_is_opened_to_see_whether_a_run_is_whole(tmp_path, make, name):
     log_of(tmp_path / "run", ABOUT, LINE)
     (tmp_path / "run" / name).unlink(missing_ok=True)
@@ -244,13 +244,14 @@ def test_a_log_that_is_a_pipe_or_a_device_is_not_blank(tmp_path, make):
     assert not RunLog.is_blank(tmp_path / "run.jsonl")
 
 
-def test_a_file_of_another_length_is_not_read_for_its_sum(tmp_path):
+@pytest.mark.parametrize("name", ["run.jsonl", "metrics.json"])
+def test_a_file_of_another_length_is_not_read_for_its_sum(tmp_path, name):
     log_of(tmp_path / "run", ABOUT, LINE)
-    write_sums(tmp_path / "run", b"{}")
-    with (tmp_path / "run" / "metrics.json").open("wb") as file:
+    write_metrics(tmp_path / "run" / "metrics.json", {}, sums_of(tmp_path / "run"))
+    with (tmp_path / "run" / name).open("wb") as file:
         file.truncate(2**40)  # on the disk it has no bytes
 
-    assert damaged(tmp_path / "run") == ["metrics.json"]
+    assert damaged(tmp_path / "run") == [name]
 
 
 @pytest.mark.parametrize("text", ["process x on HOST", "process -9999999999999999999999 on HOST"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 from importlib.machinery import ModuleSpec
@@ -12,18 +11,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.kill_runs import equal
 from helpers.sweeping import command_line, files_in
 
 import curricula
 from baselines.lstm_ppo import LSTMPPO
-from ctgraph_rl import Block, CTGraphEnv, Curriculum, Protocol, RunLog, evaluate, packages
+from ctgraph_rl import Block, CTGraphEnv, Curriculum, Protocol, RunLog, evaluate, learn_curriculum, packages
+from ctgraph_rl.log.damage import metrics_of
 from ctgraph_rl.log.provenance import NUMBERS, name_in_logs
+from ctgraph_rl.log.saved import without_moments
 from ctgraph_rl.log.sums import RESULTS
 from ctgraph_rl.metrics import definitions
 from ctgraph_rl.run import run
 from ctgraph_rl.runs import job
 from ctgraph_rl.runs.config import target
 from ctgraph_rl.runs.job import with_changes
+from ctgraph_rl.runs.load import load
 from curricula.paper import ct_su_b1
 
 SHORT = ("curriculum.num_frames=1024", "agent.num_envs=128", "agent.num_steps=8", "agent.hidden_size=8")
@@ -53,8 +56,7 @@ def copy_of(finished, tmp_path) -> Path:
 def test_a_run_writes_its_results_and_nothing_else(finished):
     hydra_files = {".hydra/config.yaml", ".hydra/hydra.yaml", ".hydra/overrides.yaml"}
 
-    tables = {"evaluations.csv", "training.csv", "performance.csv"}
-    assert set(RESULTS) == {"run.jsonl", *tables, "metrics.json", "sums.json", "agent.pt", "curriculum.json"}
+    assert set(RESULTS) == {"run.jsonl", "metrics.json", "agent.pt", "curriculum.json"}
     assert files_in(finished) == {f"out/{name}" for name in {*hydra_files, *RESULTS}}
 
 
@@ -76,6 +78,7 @@ def test_the_first_line_of_the_log_holds_all_that_the_numbers_depend_on(finished
         "evaluation",
         "protocol",
         "experts",
+        "save_optimiser",
     }
     assert first["config"]["curriculum"]["num_frames"] == 1024
     assert set(first["versions"]) == {"ctgraph_rl", "torch", "torchrl", "tensordict", "python"}
@@ -85,16 +88,23 @@ def test_the_first_line_of_the_log_holds_all_that_the_numbers_depend_on(finished
 def test_the_files_of_a_run_agree_with_its_log(finished):
     log = RunLog.read(finished / "out" / "run.jsonl")
 
-    header, *rows = (finished / "out" / "performance.csv").read_text().splitlines()
-    metrics = json.loads((finished / "out" / "metrics.json").read_text())
+    metrics = metrics_of((finished / "out" / "metrics.json").read_bytes())
 
-    assert header == "block,frames,goal1.1,goal1.2,goal2.1,goal2.2"
-    assert [row.split(",")[:2] for row in rows] == [[str(i), str(1024 * i)] for i in range(5)]
-    assert [[float(value) for value in row.split(",")[2:]] for row in rows] == log.performance().tolist()
     assert list(metrics)[:4] == ["average_performance", "forward_transfer", "backward_transfer", "forgetting"]
     assert set(metrics) == set(definitions())
     assert metrics["average_performance"]["value"] == pytest.approx(log.performance()[-1].mean().item(), abs=1e-12)
     assert {m["episodes"] for m in log.of_kind("evaluation")} == {100}
+
+
+def test_an_agent_saved_without_its_optimiser_has_the_same_weights_and_learns_on(finished, compose, tmp_path):
+    run(compose("save_optimiser=false", *SHORT), tmp_path)
+
+    whole, alone = (torch.load(folder / "agent.pt", weights_only=True) for folder in (finished / "out", tmp_path))
+    assert equal(alone, without_moments(whole))
+    assert not equal(alone, whole)
+    agent = load(tmp_path).agent
+    learn_curriculum(curricula.su_b1_4tasks(num_frames=1024), agent)
+    assert agent.optimiser.state_dict()["state"]
 
 
 def test_the_saved_agent_performs_as_the_log_says(finished, compose):
@@ -227,7 +237,7 @@ def test_a_run_that_was_stopped_before_its_first_checkpoint_starts_anew(copy_of,
     assert not (copy_of / "restarts.jsonl").exists() and not (copy_of / "failed.txt").exists()
 
 
-@pytest.mark.parametrize("name", ["agent.pt", "performance.csv", "run.jsonl"])
+@pytest.mark.parametrize("name", ["agent.pt", "curriculum.json", "run.jsonl"])
 def test_files_of_no_run_are_not_replaced(compose, tmp_path, name):
     (tmp_path / name).write_text('{"kind": "mine"}\n')
 

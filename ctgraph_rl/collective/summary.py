@@ -19,7 +19,8 @@ from ctgraph_rl.disk import write_whole
 from ctgraph_rl.learn.messages import DELAYED, DELIVERED, DROPPED, SENT
 from ctgraph_rl.log.escape import csv_text
 from ctgraph_rl.log.files import LOG, METRICS, member_folder
-from ctgraph_rl.log.run_log import RunLog, write_metrics
+from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.log.sums import write_metrics
 from ctgraph_rl.metrics.record import HERE, MASTERED, Metric
 from ctgraph_rl.runs.read import split_by
 

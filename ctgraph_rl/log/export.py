@@ -1,4 +1,4 @@
-"""A run in another program's format.
+"""A run's tables, or its log in another program's format.
 
 l2metrics reads log format 1.1 of l2logger. A training interval, or an evaluation of a task, is one experience with its
 mean return as reward. Time stamps count experiences, so equal runs give equal files.
@@ -101,11 +101,11 @@ def main() -> None:
         log = RunLog.read(arguments.run / LOG)
         measured = any(measurement["kind"] != "run" for measurement in log.measurements)
         require((measured, f"{arguments.run} has no training and no evaluation yet: there is nothing to export"))
-        if arguments.format == "parquet":
-            arguments.out.mkdir(parents=True, exist_ok=True)
-            write_tables(log, arguments.out, parquet=True)
-        else:
+        if arguments.format == "l2logger":
             write_l2logger(log.regimes(), arguments.out)
+        else:
+            arguments.out.mkdir(parents=True, exist_ok=True)
+            write_tables(log, arguments.out, parquet=arguments.format == "parquet")
     print(f"{arguments.format}: {arguments.out}")
 
 

@@ -37,8 +37,7 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, as_path, require
-from ctgraph_rl.disk import appending, cannot_write, open_own, read_regular, write_whole
-from ctgraph_rl.log.escape import csv_text
+from ctgraph_rl.disk import appending, cannot_write, open_own, read_regular
 from ctgraph_rl.log.measurement import check, parsed
 from ctgraph_rl.metrics import Column, Curves, Regime, RegimeTable, Trained
 from ctgraph_rl.metrics.adaptation import Adaptation
@@ -274,6 +273,15 @@ class RunLog:
             rows[m["block"]][m["task"]] = m["return_mean"]
         return self._matrix(rows.values(), num_tasks)
 
+    def labels(self, count: int) -> tuple[str, ...]:
+        """The labels of the first tasks, such as the columns of `performance`."""
+        known: dict[int, str] = {}
+        for run in self.of_kind("run"):
+            known |= dict(enumerate(map(str, run.get("tasks") or ()), 1))
+        for m in self._evaluations(during=True):
+            known[m["task"]] = label_of(m)
+        return tuple(known.get(task, f"task {task}") for task in range(1, count + 1))
+
     def ends(self) -> list[int]:
         """Frames of the run at the end of each block so far; 0 for block 0."""
         ends = {0: 0}
@@ -434,25 +442,3 @@ def _row(values: Sequence[float | None]) -> Tensor:
 
 def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def write_performance(path: Path | str, log: RunLog, labels: Iterable[str]) -> None:
-    """Write the performance matrix as CSV: a line per block so far, block 0 before any training.
-
-    ``labels`` name the tasks, the last columns.
-    """
-    lines: list[list[Any]] = [["block", "frames", *labels]]
-    for block, (frames, row) in enumerate(zip(log.ends(), log.performance().tolist(), strict=False)):
-        lines.append([block, frames, *row])
-    write_whole(path, csv_text(lines, "\r\n"))
-
-
-def write_metrics(path: Path | str, metrics: ReadOnlyValues) -> None:
-    """Write metrics as JSON: by name the value, definition, formula and source, or why it is undefined."""
-    write_whole(path, metrics_text(metrics))
-
-
-def metrics_text(metrics: ReadOnlyValues) -> bytes:
-    """Return the content of `METRICS`."""
-    content = {name: {**vars(metric), "n_seeds": 1, "interval": None} for name, metric in metrics.items()}
-    return (json.dumps(content, indent=2) + "\n").encode()

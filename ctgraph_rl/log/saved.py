@@ -82,6 +82,15 @@ def _require_small(value: Any, num_bytes: int) -> None:
     )
 
 
+def without_moments(state: Any) -> Any:
+    """Return a learner's state without what its optimisers keep of each weight, such as Adam's moments."""
+    if isinstance(state, Mapping):
+        if {"state", "param_groups"} <= state.keys():
+            return {**state, "state": {}}
+        return {name: without_moments(value) for name, value in state.items()}
+    return [without_moments(value) for value in state] if isinstance(state, list) else state
+
+
 def sum_of_state(state: Any) -> str:
     """Return the SHA-256 of tensors and plain values: names, types, shapes and bits, however saved."""
     found = hashlib.sha256()

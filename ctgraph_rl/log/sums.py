@@ -1,6 +1,6 @@
-"""Length and SHA-256 of each file of a finished run, in ``sums.json``, so that damage is noticed.
+"""Length and SHA-256 of each file of a finished run, in its ``metrics.json``, so that damage is noticed.
 
-It is written after all other results, right before ``metrics.json``, which it covers, too. ``run`` differs each time.
+``files`` there has them; of ``metrics.json`` they are those of the metrics alone. ``run`` differs each time.
 """
 
 from __future__ import annotations
@@ -12,53 +12,87 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, require
 from ctgraph_rl.disk import read_regular, write_whole
-from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG, METRICS
+from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG, METRICS, MOST_BYTES_OF_METRICS
 from ctgraph_rl.strict import json_value
 
-SUMS = "sums.json"
+FILES = "files"
+"""Key of the sums beside the metrics."""
 
-MOST_BYTES_OF_SUMS = 2**16
-
-TABLES = ("evaluations.csv", "training.csv", "performance.csv")
-
-RESULTS = (LOG, CURRICULUM, AGENT, *TABLES, SUMS, METRICS)
+RESULTS = (LOG, CURRICULUM, AGENT, METRICS)
 """Files of a run, in the order of writing; ``curriculum.json`` only for parts of this package's classes."""
 
 
-def write_sums(run_dir: Path, metrics: bytes) -> None:
-    """Write the sums of a directory's results and of the metrics to come."""
-    files = {}
+def write_metrics(path: Path | str, metrics: ReadOnlyValues, sums: ReadOnlyValues | None = None) -> None:
+    """Write metrics as JSON: by name the value, definition, formula and source, or why it is undefined.
+
+    Terms are left out, as pairs of tasks grow with the square of tasks; `ctgraph_rl.log.scores.scores` has them.
+
+    Args:
+        sums: of the other files of a run.
+    """
+    content = {name: _without_terms(metric) for name, metric in metrics.items()}
+    if sums is not None:
+        files = {**sums, METRICS: sum_of(_text(content))}
+        content = {FILES: {"run": uuid4().hex, **files}, **content}
+    write_whole(path, _text(content))
+
+
+def _without_terms(metric: Any) -> NamedValues:
+    values = {**vars(metric), "n_seeds": 1, "interval": None}
+    del values["terms"]
+    return values
+
+
+def _text(content: ReadOnlyValues) -> bytes:
+    return (json.dumps(content, indent=2) + "\n").encode()
+
+
+def sums_of(run_dir: Path) -> NamedValues:
+    """Return the sums of a run's files other than its metrics."""
+    found = {}
     for name in RESULTS:
-        if name not in (SUMS, METRICS) and (run_dir / name).exists():
-            files[name] = sum_of((run_dir / name).read_bytes())
-    files[METRICS] = sum_of(metrics)
-    write_whole(run_dir / SUMS, (json.dumps({"run": uuid4().hex, "files": files}, indent=2) + "\n").encode())
+        if name != METRICS and (run_dir / name).exists():
+            found[name] = sum_of((run_dir / name).read_bytes())
+    return found
 
 
 def is_complete(run_dir: Path) -> bool:
     """Return whether a run says that it is complete and its files have their lengths.
 
-    Without sums, files must not be empty. Only the sums are read, as a sweep asks this of every cell.
+    Without sums, files must not be empty. Only the metrics are read, as a sweep asks this of every cell.
     """
-    sizes = {}
-    for name in RESULTS:
-        if (run_dir / name).exists():
-            sizes[name] = (run_dir / name).stat().st_size
-    if METRICS not in sizes or SUMS not in sizes:
-        return METRICS in sizes and all(sizes.values())
-    sums = stored_sums(run_dir)
-    return bool(sums) and all(sizes.get(name) == sums[name].get("bytes") for name in sums)
-
-
-def stored_sums(run_dir: Path) -> Mapping[str, Mapping[str, Any]]:
-    """Return the stored sums by file, none if unreadable."""
     try:
-        files = json_value(read_regular(run_dir / SUMS, MOST_BYTES_OF_SUMS))["files"]
-        ours = METRICS in files and all(name in RESULTS and isinstance(files[name], dict) for name in files)
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
-    return files if ours else {}
+        sums = stored_sums(run_dir)
+    except (OSError, ValueError):
+        return False
+    sizes = {name: (run_dir / name).stat().st_size for name in RESULTS if (run_dir / name).exists()}
+    if sums is None:
+        return all(sizes.values())
+    return all(sizes.get(name) == sums[name]["bytes"] for name in sums)
+
+
+def stored_sums(run_dir: Path) -> Mapping[str, Mapping[str, Any]] | None:
+    """Return the stored sums of all files but the metrics, which are compared; None if there are none.
+
+    Raises:
+        OSError: without metrics.
+        ValueError: if they are not what was written.
+    """
+    content = json_value(read_regular(run_dir / METRICS, MOST_BYTES_OF_METRICS))
+    require((isinstance(content, dict), "it does not hold metrics of ours"))
+    if FILES not in content:
+        return None
+    files = content.pop(FILES)
+    try:
+        own = files.pop(METRICS)
+        del files["run"]
+        are_sums = all(name in RESULTS and {"bytes", "sha256"} <= files[name].keys() for name in files)
+    except (AttributeError, KeyError, TypeError):
+        are_sums = False
+    require((are_sums and own == sum_of(_text(content)), "it is not what was written"))
+    return files
 
 
 def sum_of(content: bytes) -> dict[str, Any]:

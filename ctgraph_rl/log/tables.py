@@ -1,4 +1,4 @@
-"""A run's log as tidy tables: one row per evaluation of a task, one row per training interval.
+"""A run's log as tidy tables: one row per evaluation of a task, one row per training interval; the performance matrix.
 
 CSV always, Parquet with ``pip install 'ctgraph_rl[tables]'``. The first columns name the run, so tables of many runs
 can be concatenated. Unmeasured values are empty or null. A reader in three lines::
@@ -67,7 +67,7 @@ TABLES = {"evaluation": ("evaluations", EVALUATIONS), "training": ("training", T
 
 
 def write_tables(log: RunLog, folder: Path | str, parquet: bool | None = None) -> list[Path]:
-    """Write ``evaluations`` and ``training`` into a folder; return the files.
+    """Write ``evaluations``, ``training`` and ``performance.csv`` into a folder; return the files.
 
     Args:
         log: the run's log.
@@ -90,7 +90,18 @@ def write_tables(log: RunLog, folder: Path | str, parquet: bool | None = None) -
         if parquet:
             written.append(Path(folder) / f"{name}.parquet")
             write_whole(written[-1], _parquet(types, rows))
+    written.append(Path(folder) / "performance.csv")
+    write_performance(written[-1], log)
     return written
+
+
+def write_performance(path: Path | str, log: RunLog) -> None:
+    """Write the performance matrix as CSV: a line per block so far, block 0 before any training; a column per task."""
+    performance = log.performance()
+    lines: list[list[Any]] = [["block", "frames", *log.labels(performance.shape[1])]]
+    for block, (frames, row) in enumerate(zip(log.ends(), performance.tolist(), strict=False)):
+        lines.append([block, frames, *row])
+    write_whole(path, csv_text(lines, "\r\n"))
 
 
 def check_table(path: Path) -> None:

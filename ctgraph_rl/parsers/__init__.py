@@ -30,7 +30,7 @@ CHANGES: dict[str, type] = {
 DPI = 160
 """Pixels an inch of a figure."""
 
-EXPORT_FORMATS = ("l2logger", "parquet")
+EXPORT_FORMATS = ("l2logger", "parquet", "csv")
 LEVELS = ("rescored", "rerun", "held_out")
 """How far a submission is verified."""
 
@@ -106,11 +106,11 @@ def draw() -> ArgumentParser:
 
 
 def export() -> ArgumentParser:
-    """Write a run in the format of another program.
+    """Write the tables of a run, or its log in the format of another program.
 
-    parquet: the tidy tables of a run as Parquet and CSV. l2logger: log format 1.1, which l2metrics reads; a
-    training interval, and an evaluation of a task, is one experience with its mean return as reward; time stamps
-    count experiences, so runtimes mean nothing.
+    csv: performance.csv, the performance matrix, with evaluations.csv and training.csv. parquet: these, and the last
+    two also as Parquet. l2logger: log format 1.1, which l2metrics reads; a training interval, and an evaluation of a
+    task, is one experience with its mean return as reward; time stamps count experiences, so runtimes mean nothing.
     """
     parser = _parser(export)
     _add(parser, "run", "a run directory")

@@ -119,7 +119,7 @@ def _tasks(name: str, history: History, curves: Mapping[str, str]) -> Table:
 
     A best of 0 or less has no block.
     """
-    where = f"performance.csv has it after each of {len(history.ends) - 1} blocks"
+    where = f"ctgraph-rl export has it after each of {len(history.ends) - 1} blocks"
     table = Table(title=_text(f"{name}: mean return on each task; {where}"))
     for heading in ("task", "before", "best", "in block", "at end"):
         table.add_column(heading, justify="left" if heading == "task" else "right")

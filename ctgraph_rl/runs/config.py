@@ -201,7 +201,7 @@ def check_settings(cfg: DictConfig) -> None:
     require((is_int(cfg.seed, 0, 2**63 - 1), f"seed must be an integer in [0, 2**63), got {cfg.seed!r}"))
     folder = cfg.experts_dir
     require((isinstance(folder, str) and bool(folder), f"experts_dir must be the path of a folder, got {folder!r}"))
-    for switch in ("experts", "report", "portable", "together"):
+    for switch in ("experts", "report", "portable", "together", "save_optimiser"):
         require((isinstance(cfg[switch], bool), f"{switch} must be true or false, got {cfg[switch]!r}"))
     evaluation = cfg.evaluation if isinstance(cfg.evaluation, DictConfig) else {}
     if evaluation.get("exact") is True:

@@ -97,6 +97,7 @@ def make_member(
         config=settings,
         checkpoints=checkpoints_of(cfg, run_dir, interrupt),
         sources=learners(settings, agent),
+        save_optimiser=cfg.save_optimiser,
     )
 
 

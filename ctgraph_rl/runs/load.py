@@ -69,6 +69,8 @@ def load(
 ) -> Trained:
     """Load the trained agent of a run, finished or not, with its method, to play or learn on.
 
+    After ``save_optimiser=false`` it learns on with new moments of its optimiser.
+
     Args:
         make_agent: for a class outside ``baselines``: the class, built with the stored settings, or a function of the
             environment's unbatched observation and action specs, such as ``partial(MyAgent, **settings)``.

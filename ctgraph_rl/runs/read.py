@@ -361,10 +361,6 @@ def _failure(path: Path) -> str | None:
 def _history(log: RunLog, values: Sequence[Value]) -> History:
     about = log.of_kind("run")[0]
     performance = log.performance().tolist()
-    labels = dict(enumerate(about.get("tasks") or (), 1))
-    for m in log.of_kind("evaluation"):
-        if not m.get("held_out"):
-            labels[m["task"]] = label_of(m)
     evaluations: dict[str, Curve] = {}
     training: dict[int, Curve] = {}
     for task, held_out, block, _, frames, _, metric, value in values:
@@ -378,7 +374,7 @@ def _history(log: RunLog, values: Sequence[Value]) -> History:
     for line in log.of_kind("experts"):
         experts_together += ["together" in each for each in line["experts"]]
     return History(
-        labels=tuple(str(labels.get(task, f"task {task}")) for task in range(1, len(performance[0]) + 1)),
+        labels=log.labels(len(performance[0])),
         trained=tuple(tuple(number - 1 for number in block) for block in about.get("trained") or ()),
         ends=tuple(log.ends()),
         performance=performance,

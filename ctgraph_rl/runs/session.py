@@ -30,10 +30,10 @@ from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, FAILURE, LOG, METRICS, Locks
 from ctgraph_rl.log.provenance import NUMBERS_TOGETHER, code_changes, machine, provenance
-from ctgraph_rl.log.run_log import RunLog, metrics_text, write_metrics, write_performance
+from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.log.saved import without_moments
 from ctgraph_rl.log.scores import scores
-from ctgraph_rl.log.sums import RESULTS, write_sums
-from ctgraph_rl.log.tables import write_tables
+from ctgraph_rl.log.sums import RESULTS, sums_of, write_metrics
 from ctgraph_rl.packages import check_packages
 from ctgraph_rl.runs import config
 from ctgraph_rl.runs.checkpoints import Checkpoints, RunState, newest_of_all, offer_all
@@ -70,6 +70,7 @@ class RunMember(Member):
         sources: classes and functions that learn, for `provenance`, if known.
         together: the seeds of its batch; none for a single run.
         experts: each task's single-task expert, named in the log.
+        save_optimiser: whether the weights at the end come with the optimiser's moments.
         listeners: called with every measurement.
     """
 
@@ -79,6 +80,7 @@ class RunMember(Member):
     sources: Iterable[str] | None
     together: Sequence[int] = ()
     experts: Sequence[Expert] | None = None
+    save_optimiser: bool = True
     listeners: list[Callable[[NamedValues], object]] = field(default_factory=list)
 
     @property
@@ -141,7 +143,8 @@ class RunMember(Member):
         self.log.close()
         if self.agent is not None:
             weights = io.BytesIO()
-            torch.save(self.agent.state_dict(), weights)
+            state = self.agent.state_dict()
+            torch.save(state if self.save_optimiser else without_moments(state), weights)
             write_whole(self.run_dir / AGENT, weights.getvalue())
         experts = None if self.experts is None else [expert.log for expert in self.experts]
         write_results(self.log, self.curriculum, self.run_dir, experts)
@@ -341,12 +344,8 @@ def mark_failure(run_dir: Path) -> Iterator[None]:
 
 
 def write_results(log: RunLog, curriculum: Curriculum, run_dir: Path, experts: Sequence[RunLog] | None = None) -> None:
-    """Write a closed log's tables, the sums of all results and, last, the metrics."""
-    write_tables(log, run_dir, parquet=False)
-    write_performance(run_dir / "performance.csv", log, curriculum.labels)
-    metrics = scores(log, curriculum, experts)
-    write_sums(run_dir, metrics_text(metrics))
-    write_metrics(run_dir / METRICS, metrics)
+    """Write the metrics of a closed log, with the sums of all results."""
+    write_metrics(run_dir / METRICS, scores(log, curriculum, experts), sums_of(run_dir))
 
 
 def remove_results(run_dir: Path) -> None:

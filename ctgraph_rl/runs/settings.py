@@ -37,6 +37,7 @@ _BACKBONE: NamedValues = {"backbone_seed": None}
 ADDED: dict[str, NamedValues] = {
     "run": {
         "portable": False,
+        "save_optimiser": True,
         "protocol.guide_frames": None,
         "evaluation.adapt_episodes": None,
         "evaluation.exact": None,

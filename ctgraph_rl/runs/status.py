@@ -17,8 +17,16 @@ from typing import TYPE_CHECKING, NamedTuple
 from ctgraph_rl.disk import read_regular, read_text
 from ctgraph_rl.learn.progress import TextBar
 from ctgraph_rl.log.escape import terminal_text
-from ctgraph_rl.log.files import CHECKPOINTS, FAILURE, LOCK, LOG, METRICS, MOST_BYTES_OF_A_REASON
-from ctgraph_rl.log.sums import MOST_BYTES_OF_SUMS, SUMS, is_complete
+from ctgraph_rl.log.files import (
+    CHECKPOINTS,
+    FAILURE,
+    LOCK,
+    LOG,
+    METRICS,
+    MOST_BYTES_OF_A_REASON,
+    MOST_BYTES_OF_METRICS,
+)
+from ctgraph_rl.log.sums import is_complete
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -55,10 +63,10 @@ class RunOutcome(NamedTuple):
     def of(cls, folder: Path) -> RunOutcome:
         """Return a directory's outcome; clocks of machines are not compared."""
         results = _identity(folder / METRICS)
-        sums = b""
+        content = b""
         with suppress(OSError, ValueError):
-            sums = read_regular(folder / SUMS, MOST_BYTES_OF_SUMS)
-        return cls(results and (results, sums), _identity(folder / FAILURE))
+            content = read_regular(folder / METRICS, MOST_BYTES_OF_METRICS)
+        return cls(results and (results, content), _identity(folder / FAILURE))
 
 
 NOTHING = RunOutcome()

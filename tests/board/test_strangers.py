@@ -16,7 +16,6 @@ from helpers.submissions import edit_run
 from ctgraph_rl.board.rescore import rescore
 from ctgraph_rl.board.standings.entries import read_entries
 from ctgraph_rl.board.submission import read_submission
-from ctgraph_rl.log.sums import SUMS
 from ctgraph_rl.runs.read import find_runs
 
 
@@ -127,7 +126,6 @@ def test_a_broken_run_is_one_line_and_no_end_for_others(tiny_home, tmp_path, fil
     shutil.copytree(tiny_home / "runs", tmp_path / "runs")
     path = tmp_path / "runs" / "tiny-seed0" / file
     path.write_bytes(path.read_bytes() + content if file == "run.jsonl" else content)
-    (tmp_path / "runs" / "tiny-seed0" / SUMS).unlink()
 
     runs, problems = find_runs([tmp_path / "runs"])
 

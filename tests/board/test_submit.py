@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from helpers.made_runs import remove_sums
 from helpers.sweeping import command_line
 
 from ctgraph_rl import Recorder, RunLog
@@ -40,7 +41,7 @@ def edit(run: Path, change: Callable[[dict], object]) -> None:
     about = json.loads(first)
     change(about)
     (run / "run.jsonl").write_text(json.dumps(about) + "\n" + rest)
-    (run / "sums.json").unlink(missing_ok=True)
+    remove_sums(run)
 
 
 def test_a_submission_has_a_line_for_each_seed_and_what_the_logs_give(tiny_submission, tiny_home, tiny_track):
@@ -130,7 +131,7 @@ def failed(run: Path) -> None:
 
 
 def damage(run: Path) -> None:
-    (run / "performance.csv").write_text("block\n")
+    (run / "curriculum.json").write_text("{}")
 
 
 @pytest.mark.parametrize(
@@ -155,7 +156,7 @@ def damage(run: Path) -> None:
             r"seed1 has no results \(unfinished: 256 of 256 frames\): finish it, or account for it: failed: {1: why}",
         ),
         (failed, r"tiny-seed1 has no results \(failed: FloatingPointError: the loss is nan\): finish it"),
-        (damage, "tiny-seed1 has files that are not as they were written, performance.csv: run it again"),
+        (damage, "tiny-seed1 has files that are not as they were written, curriculum.json: run it again"),
         (shutil.rmtree, "seeds 1 are missing: track tiny-v1 has seeds 0, 1"),
     ],
 )

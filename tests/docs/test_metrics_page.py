@@ -17,7 +17,7 @@ import curricula
 from ctgraph_rl import Block, RunLog, metrics
 from ctgraph_rl.log import tables
 from ctgraph_rl.log.provenance import provenance
-from ctgraph_rl.log.run_log import write_metrics
+from ctgraph_rl.log.sums import write_metrics
 from ctgraph_rl.metrics.lifetime import ROUNDING
 from ctgraph_rl.runs.experts import Expert
 from ctgraph_rl.runs.recorder import Recorder

@@ -140,4 +140,3 @@ def test_stable_baselines3_is_measured_by_the_protocol(tmp_path):
 
     assert recorder.log.performance().shape == (5, 4)
     assert recorder.metrics["average_performance"].value == 0.0  # without memory, a little training: at most luck
-    assert (tmp_path / "sb3" / "performance.csv").read_text().count("\n") == 6

@@ -9,7 +9,6 @@ fork one that has imported everything.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import os
 import random
@@ -25,8 +24,7 @@ from typing import Any
 
 import torch
 
-from ctgraph_rl.log.damage import damaged
-from ctgraph_rl.log.sums import TABLES
+from ctgraph_rl.log.damage import damaged, metrics_of
 
 TINY = ["agent.num_envs=16", "agent.num_steps=8", "agent.hidden_size=8", "checkpoint_seconds=0.01"]
 BLOCKS = ["curriculum=fo_b1_4tasks", "curriculum.num_frames=512", "evaluation.num_episodes=4", "evaluation.every=256"]
@@ -40,7 +38,7 @@ ADAPTS = ["evaluation.adapt_episodes=1"]
 CONF = Path(__file__).resolve().parents[2] / "conf" / "agent"
 
 RUNS: dict[str, list[str]] = {path.stem: BLOCKS for path in CONF.glob("*.yaml") if "_target_" in path.read_text()} | {
-    "a2c": [*BLOCKS, "protocol.boundaries=hidden"],
+    "a2c": [*BLOCKS, "protocol.boundaries=hidden", "save_optimiser=false"],
     "dqn": [*BLOCKS, *REPLAY, "agent.priority_alpha=0.6"],
     "drqn": [*BLOCKS, *REPLAY],
     "lstm_ppo": [*BLOCKS, *MINIBATCHES, "protocol.task_id=one_hot"],
@@ -55,7 +53,8 @@ RUNS: dict[str, list[str]] = {path.stem: BLOCKS for path in CONF.glob("*.yaml") 
 }
 """What every agent learns: small, with as many different things in it as a run can have."""
 
-COMPARED = ("performance.csv", "metrics.json", "curriculum.json")
+COMPARED = {"curriculum.json": bytes, "metrics.json": metrics_of}
+"""Files, each with what is equal in equal runs."""
 
 FILE_EVENTS = {"open", "os.rename", "os.remove", "os.truncate", "os.mkdir", "os.rmdir"}
 """What Python's audit hooks tell of before it happens."""
@@ -171,7 +170,7 @@ def killed(agent: str, folder: Path, kills: int, rng: random.Random) -> Count:
 
 def differences(one: Path, other: Path) -> list[str]:
     """The results in which two run directories differ, and what should not be there any more."""
-    found = [name for name in COMPARED if (one / name).read_bytes() != (other / name).read_bytes()]
+    found = other_files(one, other)
     weights = [torch.load(run_dir / "agent.pt", weights_only=True) for run_dir in (one, other)]
     found += ["agent.pt"] if not equal(*weights) else []
     logs = [lines(run_dir) for run_dir in (one, other)]
@@ -180,22 +179,23 @@ def differences(one: Path, other: Path) -> list[str]:
     return found + [f"{path} is left" for path in left]
 
 
+def other_files(one: Path, other: Path) -> list[str]:
+    """The files of `COMPARED` that differ."""
+    return [
+        name for name, read in COMPARED.items() if read((one / name).read_bytes()) != read((other / name).read_bytes())
+    ]
+
+
 def unlike(whole: Path, other: Path) -> list[str]:
     """All in which the runs of two folders differ."""
     pairs = [(path.parent, other / path.parent.relative_to(whole)) for path in sorted(whole.rglob("run.jsonl"))]
     found = [f"{run} has no metrics.json" for _, run in pairs if not (run / "metrics.json").exists()]
     for one, run in () if found else pairs:
         found += [f"{name} is damaged" for name in damaged(run)]
-        found += [name for name in TABLES if untimed(one / name) != untimed(run / name)]
         found += differences(one, run) if (one / "agent.pt").exists() else []
-        found += [name for name in COMPARED if (one / name).read_bytes() != (run / name).read_bytes()]
+        found += other_files(one, run)
         found += ["run.jsonl"] if lines(one) != lines(run) else []
     return found
-
-
-def untimed(table: Path) -> list[dict[str, str]]:
-    with table.open(newline="") as file:
-        return [{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(file)]
 
 
 def lines(run_dir: Path) -> list[dict[str, Any]]:

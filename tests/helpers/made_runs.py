@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
 from ctgraph_rl import RunLog, metrics
 from ctgraph_rl.log.provenance import NUMBERS
-from ctgraph_rl.log.run_log import write_metrics, write_performance
+from ctgraph_rl.log.sums import write_metrics
 from ctgraph_rl.runs.read import find_runs
 
 LABELS = ("goal1", "goal2")
@@ -60,7 +61,6 @@ def write_run(
             log.append("evaluation", **where, task=task, label=label, return_mean=value, success_rate=value)
     log.close()
     if finished:
-        write_performance(path / "performance.csv", log, labels)
         write_metrics(path / "metrics.json", metrics.of_matrix(log.performance(), trained))
     return path
 
@@ -115,3 +115,10 @@ def all_runs(paths):
 def line(rows, measure: str, agent: str = "PPO"):
     (found,) = [row for row in rows if (row.measure, row.agent) == (measure, agent)]
     return found
+
+
+def remove_sums(run_dir: Path) -> None:
+    """Make a finished run one without sums, whose files must only be readable."""
+    content = json.loads((run_dir / "metrics.json").read_text())
+    content.pop("files", None)
+    (run_dir / "metrics.json").write_text(json.dumps(content))

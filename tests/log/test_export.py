@@ -143,15 +143,15 @@ def test_a_run_that_cannot_be_exported_is_one_message(tmp_path, monkeypatch, cap
     assert not (tmp_path / "out").exists()
 
 
-def test_the_command_exports_tables(tmp_path, monkeypatch):
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_the_command_exports_tables(tmp_path, monkeypatch, kind):
     log = RunLog(tmp_path / "run.jsonl")
     log.append("run", trained=[[1]])
     log.append("training", block=1, frames=8, episodes=1, return_mean=0.5)
     log.close()
 
-    command_line(monkeypatch, tmp_path, "--format", "parquet", "--out", tmp_path / "tables")
+    command_line(monkeypatch, tmp_path, "--format", kind, "--out", tmp_path / "tables")
 
-    names = ("evaluations", "training")
-    assert {path.name for path in (tmp_path / "tables").iterdir()} == {
-        f"{n}.{e}" for n in names for e in ("csv", "parquet")
-    }
+    of_parquet = {"evaluations.parquet", "training.parquet"} if kind == "parquet" else set()
+    tables = {"evaluations.csv", "training.csv", "performance.csv"}
+    assert {path.name for path in (tmp_path / "tables").iterdir()} == tables | of_parquet

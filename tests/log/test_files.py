@@ -11,16 +11,20 @@ import subprocess
 import sys
 import threading
 from contextlib import closing
+from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
+import torch
 from helpers.stopped_runs import StopsAfter, learn_into
 
-from ctgraph_rl import RunLog, disk
+from ctgraph_rl import RunLog, disk, metrics
 from ctgraph_rl.disk import write_whole
 from ctgraph_rl.log import files
+from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.files import LOCK, LOG, METRICS, Locks, locked
-from ctgraph_rl.log.sums import SUMS, stored_sums
+from ctgraph_rl.log.sums import stored_sums, sum_of, write_metrics
 from ctgraph_rl.runs.status import status_of
 
 HOLD = """
@@ -301,8 +305,36 @@ def test_a_named_file_is_written_whole_and_a_link_to_it_through_the_link(tmp_pat
     assert (tmp_path / "old").read_text() == "text"
 
 
-@pytest.mark.parametrize("files", [{LOG: {}}, {METRICS: {}, "other": {}}, {METRICS: 1}])
-def test_sums_without_that_of_the_metrics_or_of_anything_else_are_none(tmp_path, files):
-    (tmp_path / SUMS).write_text(json.dumps({"files": files}))
+def stored(tmp_path: Path) -> Any:
+    """What `write_metrics` stored, with the sum of a log."""
+    metric = metrics.average_performance(torch.eye(2, dtype=torch.float64), [(0,)])
+    write_metrics(tmp_path / METRICS, {"average_performance": metric}, {LOG: sum_of(b"log")})
+    return json.loads((tmp_path / METRICS).read_text())
 
-    assert stored_sums(tmp_path) == {}
+
+def test_the_sums_of_a_run_are_beside_its_metrics(tmp_path):
+    stored(tmp_path)
+
+    assert stored_sums(tmp_path) == {LOG: sum_of(b"log")}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda content: content["files"].pop(METRICS),
+        lambda content: content["files"].pop("run"),
+        lambda content: content["files"].update(other=sum_of(b"")),
+        lambda content: content["files"].update({LOG: {}}),
+        lambda content: content.update(files=1),
+        lambda content: content["average_performance"].update(value=0.25),
+        lambda content: content.update(forgetting=content["average_performance"]),
+    ],
+)
+def test_sums_that_are_not_what_was_written_are_refused(tmp_path, change):
+    content = stored(tmp_path)
+    change(content)
+    (tmp_path / METRICS).write_text(json.dumps(content))
+
+    with pytest.raises(ValueError, match="it is not what was written"):
+        stored_sums(tmp_path)
+    assert damaged(tmp_path) == [METRICS]

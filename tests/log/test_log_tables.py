@@ -60,7 +60,7 @@ def test_parquet_holds_the_same_rows_with_types(log, tmp_path):
     written = write_tables(log, tmp_path, parquet=True)
 
     assert [path.name for path in written] == [
-        *("evaluations.csv", "evaluations.parquet", "training.csv", "training.parquet")
+        *("evaluations.csv", "evaluations.parquet", "training.csv", "training.parquet", "performance.csv")
     ]
     evaluations, training = (parquet.read_table(tmp_path / f"{name}.parquet") for name in ("evaluations", "training"))
     assert {field.name: str(field.type) for field in evaluations.schema} == {
@@ -83,7 +83,7 @@ def test_a_log_without_measurements_has_tables_without_rows(tmp_path):
 def test_without_pyarrow_there_is_csv_and_an_error_only_where_parquet_is_asked_for(log, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
 
-    assert [path.suffix for path in write_tables(log, tmp_path)] == [".csv", ".csv"]
+    assert [path.suffix for path in write_tables(log, tmp_path)] == [".csv"] * 3
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'ctgraph_rl\[tables\]'"):
         write_tables(log, tmp_path, parquet=True)
 

@@ -25,6 +25,7 @@ import hydra
 import numpy as np
 import pytest
 from helpers.kill_runs import unlike
+from helpers.made_runs import remove_sums
 from helpers.scripted import DECISION_ID, ONE, TWO
 from helpers.small_agents import TINY
 from helpers.sweeping import sweep
@@ -311,19 +312,18 @@ def copied(complete, tmp_path, monkeypatch) -> Path:
 LOST = {
     **{name: lambda _: b"" for name in RESULTS if name != "run.jsonl"},
     "run.jsonl": lambda content: content[: content.rindex(b"\n", 0, -1) + 1],
-    "performance.csv": lambda content: bytes(len(content)),
+    "curriculum.json": lambda content: bytes(len(content)),
 }
 """What the machine may leave of each file."""
 
 
-WITH_SUMS = ("run.jsonl", "sums.json", "agent.pt")
-WITHOUT_SUMS = [name for name in LOST if name not in ("run.jsonl", "sums.json")]  # a log without its end is readable
+WITHOUT_SUMS = [name for name in LOST if name != "run.jsonl"]  # a log without its end is readable
 
 
-@pytest.mark.parametrize(("name", "has_sums"), [*product(WITH_SUMS, [True]), *product(WITHOUT_SUMS, [False])])
+@pytest.mark.parametrize(("name", "has_sums"), [*product(LOST, [True]), *product(WITHOUT_SUMS, [False])])
 def test_a_complete_run_with_a_damaged_file_is_resumed_from_its_checkpoint(copied, complete, capsys, name, has_sums):
     if not has_sums:
-        (copied / "sums.json").unlink()
+        remove_sums(copied)
     (copied / name).write_bytes(LOST[name]((copied / name).read_bytes()))
 
     start()
@@ -333,7 +333,7 @@ def test_a_complete_run_with_a_damaged_file_is_resumed_from_its_checkpoint(copie
     assert unlike(complete, copied.parents[1]) == []
 
 
-@pytest.mark.parametrize("name", ["agent.pt", "training.csv", "sums.json"])
+@pytest.mark.parametrize("name", ["agent.pt", "curriculum.json", "metrics.json"])
 def test_without_a_checkpoint_a_damaged_run_is_refused_and_left_as_it_is(copied, name):
     shutil.rmtree(copied / "checkpoints")
     (copied / name).write_bytes(b"")

@@ -22,8 +22,8 @@ import ctgraph_rl
 from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, Task, metrics
 from ctgraph_rl.describe import describe
 from ctgraph_rl.learn.refusals import check_rows
-from ctgraph_rl.log.run_log import write_metrics
 from ctgraph_rl.log.scores import scores
+from ctgraph_rl.log.sums import write_metrics
 from ctgraph_rl.log.tables import write_tables
 from ctgraph_rl.metrics import Regime
 from ctgraph_rl.metrics.lifetime import theil_sen
@@ -133,6 +133,16 @@ def test_scores_grow_as_the_log(tmp_path):
 
     assert exponent(lambda each: scores(*each), (short, few), (long, many), growth) < 1.05
     assert exponent(lambda log: write_tables(log, tmp_path, parquet=False), short, long, growth) < 1.05
+
+
+def test_the_metrics_of_a_run_do_not_grow_with_its_tasks(tmp_path):
+    sizes = []
+    for count in (8, 32):
+        each = curriculum(count)
+        write_metrics(tmp_path / "metrics.json", scores(logged(each), each))
+        sizes.append((tmp_path / "metrics.json").stat().st_size)
+
+    assert sizes[1] < 1.05 * sizes[0]
 
 
 def peak(work: Callable[[], object]) -> int:

@@ -15,7 +15,7 @@ from rich.console import Console
 from ctgraph_rl import Recorder, RunLog, metrics
 from ctgraph_rl.log import provenance
 from ctgraph_rl.log.provenance import NUMBERS
-from ctgraph_rl.log.run_log import write_metrics
+from ctgraph_rl.log.sums import write_metrics
 from ctgraph_rl.report import page, results
 from ctgraph_rl.report.terminal import code_notes, mixed_code
 from ctgraph_rl.runs import config, job

@@ -11,7 +11,7 @@ from helpers.made_runs import write_run
 from rich.console import Console
 
 from ctgraph_rl import RunLog, metrics
-from ctgraph_rl.log.run_log import write_metrics, write_performance
+from ctgraph_rl.log.sums import write_metrics
 from ctgraph_rl.report.terminal import print_summary, sparklines
 
 LABELS = ("goal1.1", "goal1.2")
@@ -30,7 +30,6 @@ def run_dir(tmp_path):
             where = {"block": block, "frames": frames, "task": task, "label": label, "held_out": False}
             log.append("evaluation", moment="after", **where, return_mean=value)
     log.close()
-    write_performance(tmp_path / "performance.csv", log, LABELS)
     write_metrics(tmp_path / "metrics.json", metrics.summary(log.performance(), [(0,), (1,)]))
     return tmp_path
 

@@ -12,7 +12,7 @@ from helpers.made_runs import all_runs, line, make_run
 from helpers.scripted import DECISION_ID, ONE, TWO, curriculum
 
 from ctgraph_rl import Block, Recorder, metrics, parsers
-from ctgraph_rl.log.run_log import write_metrics
+from ctgraph_rl.log.sums import write_metrics
 from ctgraph_rl.report import formats, results
 from ctgraph_rl.report.results import comparisons, rows_by_seed, selected, table
 from ctgraph_rl.report.terminal import mixed_code

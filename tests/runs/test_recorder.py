@@ -147,7 +147,6 @@ def test_a_run_that_was_stopped_is_resumed_and_ends_as_if_it_had_never_been(tmp_
     whole, run = (RunLog.read(tmp_path / name / "run.jsonl").measurements for name in ("whole", "run"))
     assert reached == (stop, {"batches": stop // 4})
     assert without_time(whole) == without_time(run)
-    assert (tmp_path / "run" / "performance.csv").read_bytes() == (tmp_path / "whole" / "performance.csv").read_bytes()
     assert not (tmp_path / "run" / "checkpoints").exists()
 
 
@@ -219,8 +218,8 @@ def test_a_finished_run_is_shown_only_if_it_is_whole_and_was_never_another(tmp_p
         shown.evaluate(table(0), 4)
     with pytest.raises(ValueError, match="holds a run with seed=0 instead of 1"):
         Recorder(TASKS, tmp_path, seed=1, resume=True)
-    (tmp_path / "performance.csv").write_text("0\n")
-    with pytest.raises(ValueError, match=r"says that it is complete, but performance.csv cannot be read"):
+    (tmp_path / "curriculum.json").write_text("{}")
+    with pytest.raises(ValueError, match=r"says that it is complete, but curriculum.json cannot be read"):
         Recorder(TASKS, tmp_path, resume=True)
 
 

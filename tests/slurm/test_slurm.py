@@ -20,6 +20,7 @@ import torch
 from helpers.paths import TESTS
 
 from ctgraph_rl import RunLog
+from ctgraph_rl.log.damage import metrics_of
 
 pytestmark = pytest.mark.slurm
 
@@ -117,8 +118,8 @@ def results(run_dir: Path) -> tuple[object, ...]:
     """What a run leaves, but for times."""
     log = [{**m, "seconds": 0} for m in RunLog.read(run_dir / "run.jsonl").measurements]
     weights = torch.load(run_dir / "agent.pt", weights_only=True)
-    files = [(run_dir / name).read_text() for name in ("performance.csv", "metrics.json")]
-    return log, files, {name: value.tolist() for name, value in weights.items() if hasattr(value, "tolist")}
+    metrics = metrics_of((run_dir / "metrics.json").read_bytes())
+    return log, metrics, {name: value.tolist() for name, value in weights.items() if hasattr(value, "tolist")}
 
 
 def waiting(slurm: Callable[..., str]) -> list[str]:
