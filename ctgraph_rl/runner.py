@@ -21,8 +21,7 @@ from ctgraph_rl.runs.config import in_sweep
 
 def run_configuration(cfg: Any, run_dir: Path) -> float | None:
     """Run a configuration in an existing directory, and show its results; as `ctgraph_rl.run.run`."""
-    if cfg.objective is not None:
-        check_objective(cfg.objective, cfg.experts)
+    check_objective(cfg.objective, cfg.experts, cfg.objective_until)
     if cfg.report:
         require_packages()
     if "exchange" in cfg:
@@ -37,7 +36,12 @@ def run_configuration(cfg: Any, run_dir: Path) -> float | None:
         for each in run_dirs:
             show(each, cfg.report)
     searches = not in_sweep() or HydraConfig.get().runtime.choices["hydra/sweeper"] != "cells"
-    return objective_of(cfg.objective, run_dirs) if cfg.objective is not None and searches else None
+    if cfg.objective is None or not searches:
+        return None
+    value = objective_of(cfg.objective, run_dirs)
+    if cfg.objective_until is not None and not in_sweep():
+        print(f"{cfg.objective} after {cfg.objective_until:g} of the frames: {value:.4f}")
+    return value
 
 
 def show(run_dir: Path, report: bool) -> None:
@@ -51,4 +55,4 @@ def show(run_dir: Path, report: bool) -> None:
         return
     from ctgraph_rl.report.page import write_report  # here: most runs make no page
 
-    print(f"report: {write_report([shown]).page}")
+    print(f"report: {write_report([shown], tuning=True).page}")

@@ -64,6 +64,22 @@ REFUSED = [
     (["objective=[forgetting]"], ["objective must be a metric, got ['forgetting']: "]),
     (["objective=xyz"], ["objective must be a metric, got 'xyz': choices: ", ", average_performance, "]),
     (["objective=forward_transfer_from_experts"], ["compares with single-task experts: add experts=true"]),
+    (
+        ["objective=online_return", "objective_until=1.5"],
+        ["error: objective_until must be a share of the frames in (0, 1], such as 0.1, got 1.5\n"],
+    ),
+    (["freeze_after=0"], ["error: freeze_after must be a share of the frames in (0, 1], such as 0.1, got 0\n"]),
+    (["freeze_after=true"], ["freeze_after must be a share of the frames in (0, 1], such as 0.1, got True\n"]),
+    (["objective_until=0.5"], ["error: objective_until=0.5 needs a metric, such as objective=online_return\n"]),
+    (
+        ["objective=forgetting", "objective_until=0.5"],
+        ["objective=forgetting must be a metric of training with objective_until=0.5: ", "online_return\n"],
+    ),
+    (
+        ["objective=online_return", "objective_until=0.5", "experts=true"],
+        ["objective_until=0.5 compares with no experts: set experts=false\n"],
+    ),
+    (["exchange=l2d2c", "freeze_after=0.5"], ["freeze_after=0.5 is of a learner by itself: leave out freeze_after"]),
     (["seed=range(2)"], ["error: seed has several values: add -m to run each\n"]),
     (["agent=glob(dq*)"], ["error: agent has several values: add -m to run each\n"]),
     (

@@ -96,7 +96,8 @@ def submit(
 
 def _found(paths: Sequence[Path], only: ReadOnlyValues) -> list[Run]:
     found, problems = find_runs(paths)
-    require((not problems, why_left_out(problems)))
+    errors = [problem for problem in problems if problem.is_error]
+    require((not errors and bool(found), why_left_out(problems)))
     chosen = []
     values: dict[str, dict[str, None]] = {key: {} for key in only}
     for run in found:

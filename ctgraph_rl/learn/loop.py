@@ -159,6 +159,8 @@ class Lockstep:
         seeds: of each.
         logs: where each appends its measurements.
         saved: what `state` returned, to resume from; None: the beginning.
+        until: the share of the curriculum's frames after which learning ends, with the batch that reaches it.
+        freeze_after: the share after which no agent learns or is told of tasks; no batch that ends later changes it.
 
     Raises:
         ValueError: for a curriculum that the learners cannot learn.
@@ -173,6 +175,8 @@ class Lockstep:
         *,
         device: torch.device,
         saved: Sequence[SavedState] | None = None,
+        until: float = 1.0,
+        freeze_after: float = 1.0,
     ) -> None:
         check_rows(curriculum, group.agents[0].num_envs)
         check_ids(curriculum, group.agents[0])
@@ -182,6 +186,8 @@ class Lockstep:
         self.group = group
         self.seeds = seeds
         self.logs = logs
+        self.last_frames = curriculum.frames_of(until)
+        self.last_learned = curriculum.frames_of(freeze_after)
         self.env = self._make_env(device)
         self.can_resume = True
         self.evaluators = [Evaluator(curriculum, seed, log, device) for seed, log in zip(seeds, logs, strict=True)]
@@ -237,22 +243,22 @@ class Lockstep:
             return
         if saved is None:
             self._evaluate(0)
-        elif self.frames == self.curriculum.num_frames:  # nothing is collected any more
+        elif self.frames >= self.last_frames:  # nothing is collected any more
             self._restore_agents(saved)
-            self.group.end_task()
-            self._evaluate(self.frames)
+            self._end_segment(next(segments(self.curriculum, self.frames)))
             return
         for segment in segments(self.curriculum, self.frames):
             if self.frames == segment.start:
-                self.group.start_task(announced_id(self.curriculum, segment.blocks[0]))
                 saved = None
+                if self.frames < self.last_learned:
+                    self.group.start_task(announced_id(self.curriculum, segment.blocks[0]))
             restore = None if saved is None else partial(self._restore, saved)
             batches = collect_segment(
                 segment,
                 self.env,
                 self.group.agents[0],
                 self._evaluate,
-                policy=self.group.policy,
+                policy=self._policy(segment, saved),
                 done=self.frames - segment.start,
                 restore=restore,
                 num_seeds=len(self.logs),
@@ -265,8 +271,27 @@ class Lockstep:
                 if len(self.failed) == len(self.logs):
                     return
                 yield True
+                if self.frames >= self.last_frames:
+                    break
+            self._end_segment(segment)
+            if self.frames >= self.last_frames:
+                return
+
+    def _policy(self, segment: Segment, saved: Sequence[SavedState] | None) -> Policy:
+        """Return what acts in a segment: of an agent that was frozen before it, the policy for the announced task."""
+        task = announced_id(self.curriculum, segment.blocks[0])
+        if task is None or segment.start < self.last_learned:
+            return self.group.policy
+        if saved is not None:
+            self._restore_agents(saved)
+        [agent] = self.group.agents
+        return agent.policy_for(task)
+
+    def _end_segment(self, segment: Segment) -> None:
+        """Tell the agents that a segment ended, if it has, and evaluate them."""
+        if self.frames == segment.end <= self.last_learned:
             self.group.end_task()
-            self._evaluate(self.frames)
+        self._evaluate(self.frames)
 
     def _evaluate(self, frames: int) -> None:
         for number, (evaluator, agent) in enumerate(zip(self.evaluators, self.group.agents, strict=True)):
@@ -280,7 +305,9 @@ class Lockstep:
         self.returns = []
         share = guided(start - segment.start, self.curriculum)
         parts = [batch] if len(self.logs) == 1 else batch.chunk(len(self.logs))
-        for number, measured in enumerate(self.group.learn(batch)):
+        is_frozen = self.frames > self.last_learned
+        learnt: Sequence[Learnt] = [{} for _ in self.logs] if is_frozen else self.group.learn(batch)
+        for number, measured in enumerate(learnt):
             if number in self.failed:
                 continue
             try:

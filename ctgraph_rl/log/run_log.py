@@ -36,7 +36,7 @@ from typing import Any, BinaryIO
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import NamedValues, ReadOnlyValues, as_path, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, as_path, is_real, require
 from ctgraph_rl.disk import appending, cannot_write, open_own, read_regular
 from ctgraph_rl.log.measurement import check, parsed
 from ctgraph_rl.metrics import Column, Curves, Regime, RegimeTable, Trained
@@ -434,6 +434,13 @@ class RunLog:
 def label_of(evaluation: ReadOnlyValues) -> str:
     """Return the label, or else the number, of an evaluation's task."""
     return str(evaluation.get("label", f"task {evaluation['task']}"))
+
+
+def tuning_share(about: ReadOnlyValues) -> float | None:
+    """Return the share of the frames after which a tuning run ends, from its first line; None for other runs."""
+    config = about.get("config")
+    share = config.get("objective_until") if isinstance(config, Mapping) else None
+    return share if is_real(share, 0, 1) else None
 
 
 def _row(values: Sequence[float | None]) -> Tensor:

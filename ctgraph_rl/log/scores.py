@@ -14,10 +14,10 @@ from torch import Tensor
 from ctgraph_rl import metrics
 from ctgraph_rl.checks import NamedValues, require
 from ctgraph_rl.log.escape import listed
-from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.log.run_log import RunLog, tuning_share
 from ctgraph_rl.metrics import Curves, Metric, Undefined
 from ctgraph_rl.metrics.adaptation import Adaptation
-from ctgraph_rl.metrics.inputs import INPUTS
+from ctgraph_rl.metrics.inputs import INPUTS, OF_A_PART
 from ctgraph_rl.metrics.labels import SEVERAL, Labelling
 from ctgraph_rl.metrics.record import float64
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -71,9 +71,15 @@ def scores(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None
 def inputs_of(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None) -> NamedValues:
     """Return all of `ctgraph_rl.metrics.inputs.INPUTS`, `Undefined` if this run lacks one.
 
-    An unfinished run has measured nothing.
+    An unfinished run has measured nothing, a tuning run only `OF_A_PART`.
     """
     facts = _facts(curriculum)
+    share = next(map(tuning_share, log.of_kind("run")), None)
+    if share is not None and share < 1:
+        reason = Undefined(f"a tuning run ends after {share:g} of the frames, and has only metrics of training")
+        found = _training(log, curriculum, facts["best"], curriculum.frames_of(share))
+        known = {name: found[name] for name in OF_A_PART}
+        return {name: facts.get(name, known.get(name, reason)) for name in INPUTS}
     try:
         check_finished(log, curriculum)
     except Undefined as reason:
@@ -160,7 +166,7 @@ def _measured(
         "success_rates": log.last("success_rate", count),
         "adaptation": _adaptation(log, held_out=False),
         "held_out_adaptation": _adaptation(log, held_out=True),
-        **_training(log, curriculum, best),
+        **_training(log, curriculum, best, curriculum.num_frames),
         **_regimes(log, curriculum, best, experts),
         **_areas(curves, best, experts, trapezoids=False),
         **_areas(curves, best, experts, trapezoids=True),
@@ -174,13 +180,11 @@ OF_TRAINING = (
 """Inputs by training intervals."""
 
 
-def _training(log: RunLog, curriculum: Curriculum, best: Tensor | Undefined) -> NamedValues:
-    """Return the inputs by training intervals, which must reach the curriculum's end."""
+def _training(log: RunLog, curriculum: Curriculum, best: Tensor | Undefined, last: int) -> NamedValues:
+    """Return the inputs by training intervals, which must reach ``last`` frames."""
     reached = max((m["frames"] for m in log.of_kind("training")), default=0)
-    if 0 < reached < curriculum.num_frames:
-        reason = Undefined(
-            f"training is logged up to {reached:,} of {curriculum.num_frames:,} frames: log it to the end"
-        )
+    if 0 < reached < last:
+        reason = Undefined(f"training is logged up to {reached:,} of {last:,} frames: log it to the end")
         return dict.fromkeys(OF_TRAINING, reason)
     return {
         "episodes": log.training("episodes"),

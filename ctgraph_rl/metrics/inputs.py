@@ -35,3 +35,6 @@ INPUTS = {
     "expert_trapezoid_areas": "as ``expert_areas``, by trapezoids",
 }
 """By name; `ctgraph_rl.log.scores` gives them, or the reason why a run has none."""
+
+OF_A_PART = ("episodes", "returns", "interval_best", "labelling")
+"""Those that a tuning run has, which ends after a part of the frames."""

@@ -159,6 +159,7 @@ def report() -> ArgumentParser:
         metavar="NAME=COLOUR",
         help="of an agent in figures; repeat it for each",
     )
+    _add_tuning(parser)
     return parser
 
 
@@ -185,6 +186,7 @@ def results() -> ArgumentParser:
     _add(parser, "--csv", "also write the table with every measure into this file")
     _add(parser, "--tidy", "also write every evaluation as a row into this .csv or .parquet file", metavar="FILE")
     _add_agent(parser)
+    _add_tuning(parser)
     parser.add_argument("--compare", metavar="METRIC", help="also compare every two agents, seed by seed")
     _add(parser, "--difference", "how many seeds would find a true difference of this size", type=float)
     return parser
@@ -249,6 +251,10 @@ def _add(parser: Any, name: str, help: str, type: Any = Path, **how: Any) -> Non
 
 def _add_agent(parser: ArgumentParser, about: str = "order and rename agents; repeatable") -> None:
     parser.add_argument("--agent", action="append", default=[], metavar="NAME[=SHOWN]", help=about)
+
+
+def _add_tuning(parser: ArgumentParser) -> None:
+    parser.add_argument("--tuning", action="store_true", help="also show tuning runs, those with objective_until")
 
 
 def _add_task(parser: ArgumentParser) -> None:

@@ -28,6 +28,7 @@ def main() -> None:
                 width=arguments.width,
                 colours=arguments.colour,
                 count=count,
+                tuning=arguments.tuning,
             )
     incomplete = print_problems(report.problems, report.runs)
     num_runs = len(report.runs)

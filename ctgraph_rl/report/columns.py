@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ctgraph_rl import metrics
+from ctgraph_rl.log.run_log import tuning_share
 from ctgraph_rl.metrics import METRICS, Trained
 from ctgraph_rl.metrics.curves import find_returns
 from ctgraph_rl.runs.read import Run, by_curriculum, histories
@@ -55,10 +56,12 @@ def board_columns(curriculum: Curriculum) -> list[str]:
 
 
 def columns_of_runs(runs: Sequence[Run]) -> dict[str, tuple[str, ...]]:
-    """Return `columns` of each curriculum, by its name in tables."""
+    """Return `columns` of each curriculum, by its name in tables; with tuning runs, `online_return` is the first."""
     found = {}
     for name, some in by_curriculum(runs).items():
         known = histories(some)
         trained = max((history.trained for history in known), key=len, default=())
         found[name] = columns(trained, any(history.adaptation for history in known))
+        if any(tuning_share(run.about) is not None for run in some):
+            found[name] = "online_return", *found[name]
     return found

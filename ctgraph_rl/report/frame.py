@@ -47,7 +47,7 @@ DTYPES = {
 }
 
 
-def results(paths: Path | str | Sequence[Path | str]) -> pandas.DataFrame:
+def results(paths: Path | str | Sequence[Path | str], tuning: bool = False) -> pandas.DataFrame:
     """Return every number of finished runs as a row of one tidy table.
 
     The columns are:
@@ -66,6 +66,7 @@ def results(paths: Path | str | Sequence[Path | str]) -> pandas.DataFrame:
 
     Args:
         paths: run directories, or folders that hold them. Single-task experts count only without other runs.
+        tuning: also read tuning runs, those with ``objective_until``.
 
     Warns:
         UserWarning: for each run left out: unfinished, broken or a second copy.
@@ -87,7 +88,7 @@ def results(paths: Path | str | Sequence[Path | str]) -> pandas.DataFrame:
     require((isinstance(listed, Iterable), rule))
     listed = list(listed)
     require((bool(listed) and all(isinstance(path, (str, Path)) for path in listed), rule))
-    runs, problems = find_runs(listed)
+    runs, problems = find_runs(listed, tuning=tuning)
     finished = [run for run in runs if run.reason is None]
     unfinished = [f"{run.path}: {run.reason}" for run in runs if run.reason is not None]
     left_out = [*(problem.reason for problem in problems), *unfinished]

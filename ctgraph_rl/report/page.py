@@ -93,6 +93,7 @@ def write_report(
     width: str = "text",
     colours: Sequence[str] = (),
     count: Count = silent,
+    tuning: bool = False,
 ) -> Report:
     """Write ``report.html``, ``report.md``, ``tables.tex`` and ``figures/`` for all runs in or below some folders.
 
@@ -104,6 +105,7 @@ def write_report(
         width: of figures: ``text`` of a page, or one of two columns, ``column``.
         colours: of agents, each as ``NAME=COLOUR``.
         count: called after each run, agent and figure.
+        tuning: show tuning runs, too.
 
     Raises:
         ModuleNotFoundError: before any work, without what the extra ``report`` installs.
@@ -111,7 +113,7 @@ def write_report(
         BlockingIOError: if another process writes into the folder.
     """
     require_packages()
-    runs, problems = find_runs(paths, count)
+    runs, problems = find_runs(paths, count, tuning)
     require((bool(runs), why_left_out(problems)))
     runs = displayed(runs, agents)
     chosen = colours_of(runs, colours)

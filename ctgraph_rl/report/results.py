@@ -311,7 +311,7 @@ def _note(by_seed: BySeed, metric: str | None, estimate: Estimate) -> str:
 
 def print_table(run_dirs: Sequence[Path]) -> None:
     """Print the most important measures of runs."""
-    runs, problems = find_runs(run_dirs)
+    runs, problems = find_runs(run_dirs, tuning=True)
     print(FORMATS["text"](selected(table(runs)), modifications(runs), LEGENDS["exact"]))
     for problem in problems:
         print_note("left out", problem.reason)
@@ -328,7 +328,7 @@ def main() -> None:
         if arguments.tidy is not None:
             check_table(arguments.tidy)
         with StepCounter() as count:
-            runs, problems = find_runs(arguments.runs, count)
+            runs, problems = find_runs(arguments.runs, count, arguments.tuning)
             require((bool(runs), why_left_out(problems)))
             runs = displayed(runs, arguments.agent)
             pairs = {} if arguments.compare is None else comparisons(runs, arguments.compare)

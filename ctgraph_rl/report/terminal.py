@@ -21,7 +21,7 @@ from ctgraph_rl.log.provenance import numbers_of
 from ctgraph_rl.report.columns import WHERE_KNOWN, columns
 from ctgraph_rl.report.formats import measure_name
 from ctgraph_rl.report.names import modification
-from ctgraph_rl.runs.read import FOLDER, Curve, History, Problem, Run, code_of, read_run
+from ctgraph_rl.runs.read import FOLDER, MOST_SEEDS, Curve, History, Problem, Run, code_of, read_run
 from ctgraph_rl.runs.settings import as_before
 
 LIFELONG = {
@@ -31,9 +31,6 @@ LIFELONG = {
 """Transfer as ratios, where 1 means none."""
 OF_DETECTION = ("detection_delay", "false_alarms", "labels_per_task", "label_agreement")
 """Metrics that are shown; the file has all."""
-
-MOST_SEEDS = 10
-"""Seeds of a configuration that a sentence names."""
 
 LONGEST_LABEL = 24
 """Characters of a task's label in a table; a longer one loses its middle."""
@@ -194,7 +191,7 @@ def print_problems(problems: Sequence[Problem], runs: Sequence[Run]) -> bool:
         print_note("code", sentence)
     for sentence in label_notes(runs):
         print_note("labels", sentence)
-    return bool(problems or mixed)
+    return any(problem.is_error for problem in problems) or bool(mixed)
 
 
 def print_note(about: str, sentence: str) -> None:

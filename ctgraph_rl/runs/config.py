@@ -34,6 +34,7 @@ from ctgraph_rl.checks import (
     Rule,
     did_you_mean,
     is_int,
+    is_real,
     one_of,
     positive,
     require,
@@ -201,6 +202,14 @@ def check_settings(cfg: DictConfig) -> None:
     require((is_int(cfg.seed, 0, 2**63 - 1), f"seed must be an integer in [0, 2**63), got {cfg.seed!r}"))
     folder = cfg.experts_dir
     require((isinstance(folder, str) and bool(folder), f"experts_dir must be the path of a folder, got {folder!r}"))
+    for name in ("objective_until", "freeze_after"):
+        share = cfg[name]
+        alone = f"{name}={share} is of a learner by itself: leave out {name} or exchange"
+        is_share = share is None or (is_real(share, 0, 1) and share != 0)
+        require(
+            (is_share, f"{name} must be a share of the frames in (0, 1], such as 0.1, got {share!r}"),
+            (share is None or "exchange" not in cfg, alone),
+        )
     for switch in ("experts", "report", "portable", "together", "save_optimiser"):
         require((isinstance(cfg[switch], bool), f"{switch} must be true or false, got {cfg[switch]!r}"))
     evaluation = cfg.evaluation if isinstance(cfg.evaluation, DictConfig) else {}

@@ -341,7 +341,8 @@ def learn(
         for member in members.values():
             member.together = [*members]
     if members:
-        errors = session.learn([*members.values()], OneBatch(checked_device(first.device)))
+        coupling = OneBatch(checked_device(first.device), first.objective_until or 1.0, first.freeze_after or 1.0)
+        errors = session.learn([*members.values()], coupling)
         for number, error in errors.items():
             failed[[*members][number]] = error
     return failed
@@ -399,6 +400,8 @@ def run_seeds(cfg: Any, run_dir: Path) -> list[Path]:
         folder.mkdir(parents=True, exist_ok=True)
     first = build(*cells[0])
     reason = why_not_together(first.curriculum) or why_agents_learn_alone(first.agent, checked_device(cfg.device))
+    if cfg.freeze_after is not None and first.curriculum.protocol.task_id != "hidden":
+        reason = reason or "frozen agents act by the announced task, each with a policy of its own"
     if reason is None:
         run_as_one(cells, first)
         return [folder for _, folder in cells]

@@ -21,10 +21,11 @@ from ctgraph_rl.disk import read_regular
 from ctgraph_rl.learn.labels import Span, label_spans
 from ctgraph_rl.learn.progress import Count, silent
 from ctgraph_rl.log.damage import metrics_of
+from ctgraph_rl.log.escape import listed
 from ctgraph_rl.log.files import FAILURE, LOG, METRICS, MOST_BYTES_OF_METRICS, no_run, without_sweeps_files
 from ctgraph_rl.log.measurement import check, parsed
 from ctgraph_rl.log.provenance import is_ours, targets
-from ctgraph_rl.log.run_log import MOST_BYTES, SCHEMA, RunLog, label_of
+from ctgraph_rl.log.run_log import MOST_BYTES, SCHEMA, RunLog, label_of, tuning_share
 from ctgraph_rl.metrics.adaptation import Adaptation
 from ctgraph_rl.runs.experts import EXPERT
 from ctgraph_rl.runs.settings import as_before, flat
@@ -52,6 +53,9 @@ MEASURES = {
     "training": ("training_", ("return_mean", "success_rate")),
 }
 """By kind of measurement: the beginning of values' names, and the fields."""
+
+MOST_SEEDS = 10
+"""Seeds of a configuration that a sentence names."""
 
 MOST_MODULES = 3
 """Differing modules that are named; one digest stands for the others."""
@@ -198,6 +202,7 @@ class Problem(NamedTuple):
 
     path: Path
     reason: str
+    is_error: bool = True
 
 
 def why_left_out(problems: Iterable[Problem]) -> str:
@@ -214,13 +219,16 @@ def present(by_seed: BySeed) -> list[Run]:
     return list(filter(None, by_seed.values()))
 
 
-def find_runs(paths: Iterable[Path | str], count: Count = silent) -> tuple[list[Run], list[Problem]]:
+def find_runs(
+    paths: Iterable[Path | str], count: Count = silent, tuning: bool = False
+) -> tuple[list[Run], list[Problem]]:
     """Return every run in or below directories, and what is left out: unreadable logs, and duplicate runs.
 
     Single-task experts are silently left out beside other runs.
 
     Args:
         count: called after each file that is read.
+        tuning: return tuning runs, too, instead of a sentence on them.
     """
     found: list[Run] = []
     problems: list[Problem] = []
@@ -255,7 +263,24 @@ def find_runs(paths: Iterable[Path | str], count: Count = silent) -> tuple[list[
         else:
             reason += "one run twice; the second is left out"
         problems.append(Problem(run.path, reason))
-    return list(runs.values()), problems
+    if tuning:
+        return list(runs.values()), problems
+    is_tuning = split_by(runs.values(), lambda run: tuning_share(run.about) is not None)
+    return is_tuning.get(False, []), [*problems, *_tuning_notes(is_tuning.get(True, []))]
+
+
+def _tuning_notes(runs: Sequence[Run]) -> Iterator[Problem]:
+    """Yield a sentence on the tuning runs of each agent and share."""
+    for (name, agent, share), some in split_by(runs, _tuned).items():
+        trials = len({run.alike for run in some})
+        seeds = listed(sorted({run.seed for run in some}), MOST_SEEDS)
+        what = f"{len(some)} tuning runs of {agent} on {name}: {trials} trials, seeds {seeds}"
+        reason = f"{what}, the first {share:g} of the frames; --tuning shows them"
+        yield Problem(some[0].path, reason, is_error=False)
+
+
+def _tuned(run: Run) -> tuple[str, str | None, float | None]:
+    return run.group[0], run.agent, tuning_share(run.about)
 
 
 def read_run(path: Path) -> Run:

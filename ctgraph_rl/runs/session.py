@@ -228,11 +228,14 @@ class OneBatch(SessionCoupling):
     """A coupling of seeds that learn one curriculum as one batch, or of a single run.
 
     Stopped runs resume from the last checkpoint that all have, and end as if they had never stopped. Those stopped in
-    their first checkpoints begin again. Environment and agents live on ``device``.
+    their first checkpoints begin again. Environment and agents live on ``device``; ``until`` and ``freeze_after`` are
+    those of `Lockstep`.
     """
 
-    def __init__(self, device: torch.device) -> None:
+    def __init__(self, device: torch.device, until: float = 1.0, freeze_after: float = 1.0) -> None:
         self.device = device
+        self.until = until
+        self.freeze_after = freeze_after
 
     @override
     def resume(self, members: Sequence[RunMember]) -> Sequence[RunState | None]:
@@ -248,7 +251,7 @@ class OneBatch(SessionCoupling):
         if len(begun) < len(members):
             rules = [_all_begun(each, begun) for each in members if each not in begun]
         can_resume = saved is not None and (
-            saved[0]["frames"] == curriculum.num_frames or all(rule for rule, _ in rules)
+            saved[0]["frames"] >= curriculum.frames_of(self.until) or all(rule for rule, _ in rules)
         )
         if saved is not None and can_resume:
             return saved
@@ -282,8 +285,17 @@ class OneBatch(SessionCoupling):
             offer = checkpoints[0].offer_one
         seeds = [each.seed for each in members]
         logs = [each.log for each in members]
-        with ProgressBar(len(curriculum.blocks), curriculum.num_frames, console, done) as progress:
-            lockstep = Lockstep(curriculum, group, seeds, logs, device=self.device, saved=states)
+        with ProgressBar(len(curriculum.blocks), curriculum.frames_of(self.until), console, done) as progress:
+            lockstep = Lockstep(
+                curriculum,
+                group,
+                seeds,
+                logs,
+                device=self.device,
+                saved=states,
+                until=self.until,
+                freeze_after=self.freeze_after,
+            )
             with closing(lockstep):
                 run_loop(lockstep, progress, offer)
         self._had_failed = [number for number, state in enumerate(states or ()) if "failed" in state]

@@ -41,6 +41,8 @@ ADDED: dict[str, NamedValues] = {
         "protocol.guide_frames": None,
         "evaluation.adapt_episodes": None,
         "evaluation.exact": None,
+        "objective_until": None,
+        "freeze_after": None,
     },
     "baselines.dqn.DQN": _ENCODER,
     "baselines.mohqa.MOHQA": _ENCODER,

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from fractions import Fraction
 from functools import cached_property
 from html import escape
 from itertools import accumulate
@@ -133,6 +135,10 @@ class Curriculum:
     def ends(self) -> tuple[int, ...]:
         """Frames of the run at each block's end."""
         return tuple(accumulate(block.num_frames for block in self.blocks))
+
+    def frames_of(self, share: float) -> int:
+        """Return a share of the frames, rounded up."""
+        return math.ceil(Fraction(str(share)) * self.num_frames)
 
     def block_at(self, frames: int) -> int:
         """The block, from 1, of the run's frame number ``frames``; 0 for none."""
