@@ -160,7 +160,8 @@ class Lockstep:
         logs: where each appends its measurements.
         saved: what `state` returned, to resume from; None: the beginning.
         until: the share of the curriculum's frames after which learning ends, with the batch that reaches it.
-        freeze_after: the share after which no agent learns or is told of tasks; no batch that ends later changes it.
+        freeze_after: the share after which agents neither learn nor are told of tasks. A batch that ends later changes
+            nothing.
 
     Raises:
         ValueError: for a curriculum that the learners cannot learn.

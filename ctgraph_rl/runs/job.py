@@ -401,7 +401,7 @@ def run_seeds(cfg: Any, run_dir: Path) -> list[Path]:
     first = build(*cells[0])
     reason = why_not_together(first.curriculum) or why_agents_learn_alone(first.agent, checked_device(cfg.device))
     if cfg.freeze_after is not None and first.curriculum.protocol.task_id != "hidden":
-        reason = reason or "frozen agents act by the announced task, each with a policy of its own"
+        reason = reason or "a frozen agent acts by its policy for the announced task"
     if reason is None:
         run_as_one(cells, first)
         return [folder for _, folder in cells]
