@@ -160,8 +160,7 @@ class Lockstep:
         logs: where each appends its measurements.
         saved: what `state` returned, to resume from; None: the beginning.
         until: the share of the curriculum's frames after which learning ends, with the batch that reaches it.
-        freeze_after: the share after which agents neither learn nor are told of tasks. A batch that ends later changes
-            nothing.
+        freeze_after: the share after which no agent learns from a batch that ends later, or is told of tasks.
 
     Raises:
         ValueError: for a curriculum that the learners cannot learn.
