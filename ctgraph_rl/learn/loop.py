@@ -160,7 +160,7 @@ class Lockstep:
         logs: where each appends its measurements.
         saved: what `state` returned, to resume from; None: the beginning.
         until: the share of the curriculum's frames after which learning ends, with the batch that reaches it.
-        freeze_after: the share after which no agent learns from a batch that ends later, or is told of tasks.
+        freeze_after: the share after which no agent learns from a batch that ends later, or is notified of tasks.
 
     Raises:
         ValueError: for a curriculum that the learners cannot learn.
@@ -288,7 +288,7 @@ class Lockstep:
         return agent.policy_for(task)
 
     def _end_segment(self, segment: Segment) -> None:
-        """Tell the agents that a segment ended, if it has, and evaluate them."""
+        """Notify the agents that a segment ended, if it has, and evaluate them."""
         if self.frames == segment.end <= self.last_learned:
             self.group.end_task()
         self._evaluate(self.frames)
