@@ -39,6 +39,7 @@ REFUSED = [
     (["seed=abc"], ["seed must be an integer in [0, 2**63), got 'abc'"]),
     (["device=bogus"], ["device must be one of cpu", "got 'bogus'"]),
     (["num_threads=0"], ["num_threads must be in 1.."]),
+    (["log_units=3"], ["error: log_units must be true, false, batch or null, got 3\n"]),
     (["overwrite=1"], ["overwrite must be true, false or stale, got 1"]),
     (
         ["curriculum.num_frames=1000"],

@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from baselines.parts.networks import Data, Items, TensorsByName
+from baselines.parts.units import Activations, activations
 from baselines.update.compiled import compiled
 from baselines.update.measured import finite_means, table_of
 from baselines.update.trained import Trained
@@ -99,6 +100,11 @@ class Learner(TakesNumbers, Trained):
     def one_step(self, data: Data) -> Items:
         """Return `outputs` for one step of all rows, and with memory the next state under ``("next", key)``."""
         return dict(self.outputs(data))
+
+    def activations(self, data: Data) -> Activations:
+        """Return the hidden units' activations for one step of all rows, as `baselines.parts.units.activations`."""
+        sequences = {key: value.unsqueeze(1) for key, value in data.items()} if self.memory else data
+        return activations(self.policy, sequences)
 
     @property
     def needs_weights(self) -> bool:

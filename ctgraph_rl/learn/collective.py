@@ -87,6 +87,7 @@ class Member:
         seed: of its environment.
         log: where its measurements are appended.
         random: its state of torch's global generator; default: the present one, so make a member right after its agent.
+        log_units: as `ctgraph_rl.learn.lifelong.learn_curriculum`.
     """
 
     curriculum: Curriculum
@@ -94,6 +95,7 @@ class Member:
     seed: int = 0
     log: RunLog = field(default_factory=RunLog)
     random: Tensor = field(default_factory=torch.get_rng_state)
+    log_units: bool | str = False
 
 
 @takes_numbers
@@ -174,7 +176,13 @@ class _Learner:
             with self.drawing():
                 group = Alone(member.agent)
                 self.steps = Lockstep(
-                    member.curriculum, group, [member.seed], [member.log], device=device, saved=states
+                    member.curriculum,
+                    group,
+                    [member.seed],
+                    [member.log],
+                    device=device,
+                    saved=states,
+                    log_units=member.log_units,
                 )
         except ValueError as error:
             raise ValueError(f"member {number}: {error}") from error

@@ -29,6 +29,7 @@ def learn_curriculum(
     device: torch.device | str = "cpu",
     saved: ReadOnlyValues | None = None,
     checkpoint: OfferCheckpoint | None = None,
+    log_units: bool | str = False,
 ) -> RunLog:
     """Let an agent learn a curriculum block by block, evaluated as the curriculum says.
 
@@ -44,6 +45,7 @@ def learn_curriculum(
         saved: a state that ``checkpoint`` was given, to resume with the same bits. The agent is built the same way, and
             the log holds what it held then.
         checkpoint: is offered the state after every batch.
+        log_units: True: measure hidden units at starts, ends and evaluations of blocks; ``batch``: after batches, too.
 
     Returns:
         The log; ``log.performance()`` is the performance matrix.
@@ -64,7 +66,7 @@ def learn_curriculum(
     log = RunLog() if log is None else log
     device = checked_device(device)
     states = None if saved is None else [saved]
-    members = Lockstep(curriculum, Alone(agent), [seed], [log], device=device, saved=states)
+    members = Lockstep(curriculum, Alone(agent), [seed], [log], device=device, saved=states, log_units=log_units)
 
     def offer(make_states: Callable[[], list[NamedValues]], at_block_end: bool) -> None:
         if checkpoint is not None:

@@ -22,6 +22,7 @@ from ctgraph_rl.learn.collect import Policy, make_env
 from ctgraph_rl.learn.evaluate import Evaluator
 from ctgraph_rl.learn.refusals import check_adaptation, check_env, check_exact, check_ids, check_rows, resumes
 from ctgraph_rl.learn.segments import Segment, announced_id, collect_segment, guided, log_training, segments
+from ctgraph_rl.learn.unit_metrics import UnitMeter, norms, weights_of
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.task_like import close_env
@@ -161,6 +162,7 @@ class Lockstep:
         saved: what `state` returned, to resume from; None: the beginning.
         until: the share of the curriculum's frames after which learning ends, with the batch that reaches it.
         freeze_after: the share after which no agent learns from a batch that ends later, or is notified of tasks.
+        log_units: as `ctgraph_rl.learn.lifelong.learn_curriculum`.
 
     Raises:
         ValueError: for a curriculum that the learners cannot learn.
@@ -177,6 +179,7 @@ class Lockstep:
         saved: Sequence[SavedState] | None = None,
         until: float = 1.0,
         freeze_after: float = 1.0,
+        log_units: bool | str = False,
     ) -> None:
         check_rows(curriculum, group.agents[0].num_envs)
         check_ids(curriculum, group.agents[0])
@@ -188,6 +191,10 @@ class Lockstep:
         self.logs = logs
         self.last_frames = curriculum.frames_of(until)
         self.last_learned = curriculum.frames_of(freeze_after)
+        self.meters: list[UnitMeter] = []
+        if log_units:
+            for agent, log in zip(group.agents, logs, strict=True):
+                self.meters.append(UnitMeter(curriculum, agent, log, log_units))
         self.env = self._make_env(device)
         self.can_resume = True
         self.evaluators = [Evaluator(curriculum, seed, log, device) for seed, log in zip(seeds, logs, strict=True)]
@@ -252,6 +259,7 @@ class Lockstep:
                 saved = None
                 if self.frames < self.last_learned:
                     self.group.start_task(announced_id(self.curriculum, segment.blocks[0]))
+                self._measure_units(self.curriculum.block_at(segment.start + 1), "start")
             restore = None if saved is None else partial(self._restore, saved)
             batches = collect_segment(
                 segment,
@@ -297,6 +305,14 @@ class Lockstep:
         for number, (evaluator, agent) in enumerate(zip(self.evaluators, self.group.agents, strict=True)):
             if number not in self.failed:
                 evaluator.evaluate_if_due(agent, frames)
+        is_end = self.curriculum.is_end(frames)
+        if frames and (is_end or self.curriculum.moment(frames)):
+            self._measure_units(self.curriculum.block_at(frames), "end" if is_end else "during", frames)
+
+    def _measure_units(self, block: int, moment: str, frames: int | None = None) -> None:
+        for number, meter in enumerate(self.meters):
+            if number not in self.failed:
+                meter.measure(block, self.frames if frames is None else frames, moment)
 
     def _learn(self, batch: TensorDictBase, segment: Segment) -> None:
         start = self.frames
@@ -305,6 +321,7 @@ class Lockstep:
         self.returns = []
         share = guided(start - segment.start, self.curriculum)
         parts = [batch] if len(self.logs) == 1 else batch.chunk(len(self.logs))
+        before = [weights_of(meter.agent) for meter in self.meters]
         is_frozen = self.frames > self.last_learned
         learnt: Sequence[Learnt] = [{} for _ in self.logs] if is_frozen else self.group.learn(batch)
         for number, measured in enumerate(learnt):
@@ -317,10 +334,14 @@ class Lockstep:
                 seed = "" if self.group.generators is None else f"seed {self.seeds[number]}: "
                 self.failed[number] = FloatingPointError(f"{seed}{error} {where}")
                 continue
+            if self.meters:
+                measurements |= norms(self.group.agents[number], before[number], measurements)
             events = getattr(self.group.agents[number], "events", ())
             log = self.logs[number]
             part = parts[number]
             self.returns.append(log_training(log, self.curriculum, part, start, measurements, events=events))
+        if self.meters and self.meters[0].each_batch:
+            self._measure_units(self.block, "batch")
 
     def state(self) -> list[NamedValues]:
         """Return all that the rest of each member's run depends on, as tensors and plain values."""

@@ -13,6 +13,8 @@ Every line is one JSON object with a ``kind``. Schema 1:
 - ``adaptation``: where rows adapt before an evaluation, means over the rows' episodes number ``step``, from 1, and
   ``found_rate``, the share of rows that have reached the goal by then; ``exact_rate``, the success rate of the best
   search; else as ``evaluation``.
+- ``units``: `ctgraph_rl.learn.unit_metrics.unit_metrics` on the ``num_images`` of a block's tasks, or fresh ones
+  (``images``), at its ``start``, ``during`` it, at its ``end`` or after a ``batch``. ``training`` then has norms.
 
 Numbers that are not finite are null. Only ``seconds``, the time since the start, differs between two equal runs. A
 reader in three lines, for what `RunLog.read` does not give::

@@ -221,6 +221,10 @@ def check_settings(cfg: DictConfig) -> None:
     require(
         check_overwrite(cfg.overwrite),
         *one_of(RESUME, resume=cfg.resume),
+        (
+            cfg.log_units in (None, "batch") or isinstance(cfg.log_units, bool),
+            f"log_units must be true, false, batch or null, got {cfg.log_units!r}",
+        ),
         *positive(checkpoint_seconds=cfg.checkpoint_seconds),
     )
 

@@ -22,6 +22,7 @@ from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.disk import is_writable
 from ctgraph_rl.learn.refusals import notes
 from ctgraph_rl.learn.stacked import why_not_together
+from ctgraph_rl.learn.unit_metrics import unit_rules
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CHECKPOINTS, CURRICULUM, LOG, METRICS
 from ctgraph_rl.log.provenance import code, code_changes, is_unknown, learners, versions
@@ -75,7 +76,12 @@ def build(cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None = None) ->
     for task in curriculum.tasks if cfg.experts else ():  # refuses first what an agent cannot learn
         new_agent(expert_curriculum(curriculum, task), make_alone, cfg.seed)
     make_agent = with_method(make_alone, make_method, curriculum)
-    return make_member(cfg, run_dir, curriculum, make_agent, settings=config.plain(cfg), interrupt=interrupt)
+    member = make_member(cfg, run_dir, curriculum, make_agent, settings=config.plain(cfg), interrupt=interrupt)
+    usual = "plasticity" in cfg and all(holds for holds, _ in unit_rules(curriculum, member.agent))
+    member.log_units = usual if cfg.log_units is None else cfg.log_units
+    if member.log_units:
+        require(*unit_rules(curriculum, member.agent))
+    return member
 
 
 def make_member(

@@ -295,6 +295,7 @@ class OneBatch(SessionCoupling):
                 saved=states,
                 until=self.until,
                 freeze_after=self.freeze_after,
+                log_units=members[0].log_units,
             )
             with closing(lockstep):
                 run_loop(lockstep, progress, offer)

@@ -43,6 +43,7 @@ ADDED: dict[str, NamedValues] = {
         "evaluation.exact": None,
         "objective_until": None,
         "freeze_after": None,
+        "log_units": None,
     },
     "baselines.dqn.DQN": _ENCODER,
     "baselines.mohqa.MOHQA": _ENCODER,
