@@ -13,7 +13,7 @@ import torch
 from ctgraph_rl import parsers
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_real, positive, require
 from ctgraph_rl.log.escape import listed, terminal_lines, terminal_text
-from ctgraph_rl.log.files import AGENT, LOG
+from ctgraph_rl.log.files import AGENT, LOG, no_run
 from ctgraph_rl.log.measurement import without_time
 from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.log.run_log import RunLog
@@ -96,7 +96,7 @@ def _compared(name: str, one: ReadOnlyValues, other: ReadOnlyValues, most: int) 
 
 
 def _log(path: Path) -> RunLog:
-    require(((path / LOG).is_file(), f"{path} holds no run: there is no {LOG}"))
+    require(((path / LOG).is_file(), no_run(path, below=False)))
     log = RunLog.read(path / LOG)
     begins = bool(log.measurements) and log.measurements[0]["kind"] == "run"
     require((begins, f"{path / LOG} does not say what was run in its first line"))

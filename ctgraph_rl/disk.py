@@ -82,6 +82,8 @@ def write_named(path: Path | str, content: bytes | str) -> None:
 
 def cannot_write(path: Path, num_bytes: int, error: OSError) -> OSError:
     """The error, with sizes, for a file that cannot be written."""
+    if not path.parent.is_dir():
+        return FileNotFoundError(f"cannot write {path}: there is no folder {path.parent}; make it first")
     try:
         free = f"{shutil.disk_usage(path.parent).free / 1e6:.1f} MB are free"
     except OSError:
@@ -218,6 +220,15 @@ def append_line(path: Path, value: object) -> None:
 def read_text(path: str | os.PathLike[str], most: int) -> str:
     """Return `read_regular` as text, marking bytes that are not UTF-8."""
     return read_regular(path, most).decode("utf-8", "replace")
+
+
+def in_words(error: Exception) -> str:
+    """Return an error's message; of the system's the file and the reason, without a number."""
+    if not isinstance(error, OSError) or not error.strerror:
+        return str(error)
+    if error.filename is None:
+        return error.strerror
+    return f"{error.filename} cannot be opened: {error.strerror[0].lower()}{error.strerror[1:]}; check the path"
 
 
 def read_regular(path: str | os.PathLike[str], most: int) -> bytes:

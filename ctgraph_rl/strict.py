@@ -20,7 +20,7 @@ from typing import Any
 import yaml
 
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_shallow, repeated, require
-from ctgraph_rl.disk import read_regular
+from ctgraph_rl.disk import in_words, read_regular
 
 MAX_NESTING = 32
 """Most objects and lists within each other."""
@@ -96,9 +96,10 @@ def json_object(
     is_path = isinstance(path_or_dict, (str, os.PathLike))
     require((is_path, f"from_json needs the path of a JSON file or a dict, got {path_or_dict!r}"))
     try:
-        data = read_regular(path_or_dict, most)
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path_or_dict} must be a JSON file that can be read: {error}") from error
+        with within(path_or_dict):
+            data = read_regular(path_or_dict, most)
+    except OSError as error:
+        raise ValueError(in_words(error)) from error
     try:
         content = json_value(data, finite=False, nesting=nesting)
     except ValueError as error:
@@ -217,7 +218,7 @@ def files_below(folder: Path, names: Sequence[str] = ()) -> tuple[list[Path], li
 def one_line_of(error: Exception, file: Path) -> str:
     """Return why a file cannot be read, with the kind of an unforeseen error."""
     foreseen = isinstance(error, (OSError, ValueError)) and not isinstance(error, UnicodeError)
-    said = " ".join(str(error).split())
+    said = " ".join(in_words(error).split())
     return said if foreseen else f"{file} cannot be read ({type(error).__name__}: {said:.200})"
 
 

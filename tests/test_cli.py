@@ -103,7 +103,7 @@ def test_tables_fit_100_characters_where_no_terminal_says_how_many_there_are(cal
     ("words", "message"),
     [
         (["describe", "su_b1_4task"], "unknown curriculum 'su_b1_4task'; did you mean 'su_b1_4tasks'?"),
-        (["describe", "none.json"], "none.json must be a JSON file that can be read"),
+        (["describe", "none.json"], "none.json cannot be opened: no such file or directory; check the path"),
         (["describe", "su_b1_4tasks", "--frames-per-second", "0"], "frames_per_second must be a number > 0, got 0.0"),
         (["describe", "su_b1_4tasks", "--figure", "a.xyz"], "Format 'xyz' is not supported"),
         (["describe", "su_b1_4tasks", "--json", "."], ". exists: choose another path, nothing is overwritten"),

@@ -130,6 +130,7 @@ def read_method(path: Path) -> NamedValues:
         ValueError: for what is no YAML, missing or unknown keys, and values out of range; names all.
         OSError: if it cannot be read.
     """
+    require((path.exists(), f"{path} does not exist: ctgraph-rl submit --template > {path} makes one to fill in"))
     with named(path):
         method = yaml_value(read_regular(path, MOST_BYTES))
     try:

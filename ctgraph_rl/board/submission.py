@@ -209,7 +209,7 @@ def read_submission(path: Path | str, of_track: Track | None = None, config_dir:
     path = Path(path)
     file = path / SUBMISSION
     fix = "ctgraph-rl submit RUNS --to DIR writes one"
-    require((path.is_dir(), f"{path} must be the folder of a submission"))
+    require((path.is_dir(), f"{path} holds no submission: there is no such folder; {fix}"))
     require((file.is_file(), f"{path} holds no submission, it lacks {SUBMISSION}: {fix}"))
     data = read_regular(file, MOST_BYTES)
     with named(file):

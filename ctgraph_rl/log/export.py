@@ -97,7 +97,7 @@ def main() -> None:
     parser = parsers.export()
     arguments = parser.parse_args()
     with refused_by(parser):
-        require(((arguments.run / LOG).is_file(), no_run(arguments.run)))
+        require(((arguments.run / LOG).is_file(), no_run(arguments.run, below=False)))
         log = RunLog.read(arguments.run / LOG)
         measured = any(measurement["kind"] != "run" for measurement in log.measurements)
         require((measured, f"{arguments.run} has no training and no evaluation yet: there is nothing to export"))

@@ -244,11 +244,12 @@ def without_sweeps_files(paths: Iterable[Path | str]) -> list[Path]:
     return [path for path in every if path.name not in OF_A_SWEEP or path.is_dir()] or every
 
 
-def no_run(path: Path) -> str:
-    """Return why a path holds no run."""
+def no_run(path: Path, below: bool = True) -> str:
+    """Return why a path holds no run; ``below``: folders that hold runs would do, too."""
+    fix = "name a run directory" + ", or a folder that holds some" * below
     if path.is_dir():
-        return f"{path} holds no run: no {LOG} in or below it"
+        return f"{path} holds no run: no {LOG} in {'or below ' * below}it; {fix}"
     if not path.exists():
-        return f"{path} holds no run: there is no such directory"
+        return f"{path} holds no run: there is no such directory; {fix}"
     within = f", such as {path.parent}" if (path.parent / LOG).exists() else ""
     return f"{path} holds no run: it is a file; name a run directory{within}"

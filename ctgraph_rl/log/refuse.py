@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from ctgraph_rl.disk import in_words
 from ctgraph_rl.log.escape import terminal_lines
 
 
@@ -17,4 +18,4 @@ def refused_by(parser: argparse.ArgumentParser) -> Iterator[None]:
     except BrokenPipeError:
         raise
     except (ValueError, OSError, ModuleNotFoundError) as error:
-        parser.exit(2, f"{parser.prog}: error: {terminal_lines(error)}\n")
+        parser.exit(2, f"{parser.prog}: error: {terminal_lines(in_words(error))}\n")

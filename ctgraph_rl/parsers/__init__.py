@@ -10,9 +10,10 @@ import argparse
 from argparse import ArgumentParser
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import yaml
+from typing_extensions import override
 
 BOUND = 1e-4
 """Largest difference that counts as rounding, as a share of the largest value that the field has in either run."""
@@ -76,9 +77,9 @@ def collectives() -> ArgumentParser:
 
 
 def compare() -> ArgumentParser:
-    """Compare two runs: all measurements but their times, and the weights of the agents.
+    """Say whether two runs are equal: all measurements but their times, and the agents' weights, bit for bit.
 
-    The exit code is 0 for equal runs, 1 for different ones, 3 for runs that are equal up to rounding, and 2 for
+    ctgraph-rl report and ctgraph-rl results compare agents. The exit code is 0 for equal runs, 1 for different ones, 3 for runs that are equal up to rounding, and 2 for
     what is no run.
     """
     parser = _parser(compare)
@@ -240,8 +241,16 @@ def verify() -> ArgumentParser:
     return parser
 
 
+class _Parser(ArgumentParser):
+    """Refuses arguments in one line; ``--help`` shows the usage."""
+
+    @override
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: error: {message}\n")
+
+
 def _parser(command: Callable[[], ArgumentParser]) -> ArgumentParser:
-    return ArgumentParser(prog=f"ctgraph-rl {command.__name__}", description=command.__doc__)
+    return _Parser(prog=f"ctgraph-rl {command.__name__}", description=command.__doc__)
 
 
 def _add(parser: Any, name: str, help: str, type: Any = Path, **how: Any) -> None:
@@ -277,7 +286,8 @@ def existing(text: str) -> Path:
     """Read a path of runs that exists."""
     path = Path(text)
     if not path.exists():
-        raise argparse.ArgumentTypeError(f"{text} holds no run: there is no such directory")
+        fix = "name a run directory, or a folder that holds some"
+        raise argparse.ArgumentTypeError(f"{text} holds no run: there is no such directory; {fix}")
     return path
 
 

@@ -255,14 +255,18 @@ def find_runs(
         first = runs.setdefault((*run.configuration, run.seed), run)
         if first.path.resolve() == run.path.resolve():
             continue
+        left = run
+        if first.reason is not None and run.reason is None:
+            left = first
+            runs[*run.configuration, run.seed] = run
         reason = f"{first.path} and {run.path} are "
         if run.agent is None:
             name = 'Recorder(..., about={"learner": "NAME"})'
-            reason += f"both seed {run.seed} of the learner of {run.settings[FOLDER]}, the second is left out: "
+            reason += f"both seed {run.seed} of the learner of {run.settings[FOLDER]}, {left.path} is left out: "
             reason += f"learners need names, such as {name}, or separate folders"
         else:
-            reason += "one run twice; the second is left out"
-        problems.append(Problem(run.path, reason))
+            reason += f"one run twice; {left.path} is left out"
+        problems.append(Problem(left.path, reason if left.reason is None else f"{reason} ({left.reason})"))
     if tuning:
         return list(runs.values()), problems
     is_tuning = split_by(runs.values(), lambda run: tuning_share(run.about) is not None)

@@ -158,7 +158,7 @@ def test_settings_of_a_graph_change_goals_and_waits_and_nothing_else():
     [
         ({}, "config must be a JSON file of a graph's parameters, such as graph.json, got None"),
         ({"config": 3}, "config must be a JSON file of a graph's parameters, such as graph.json, got 3"),
-        ({"config": "none.json"}, "none.json must be a JSON file that can be read"),
+        ({"config": "none.json"}, "none.json cannot be opened: no such file or directory; check the path"),
         ({"config": {"graph_shape": {"d": 2, "b": 2, "q": 1}}}, "Table 3 has no graph_shape.q"),
         ({"config": GRAPH, "goals": [[1, 2]]}, r"goals must have as many decisions as the depths, \[3\]"),
         ({"config": GRAPH, "order": "random"}, "order must be one of product, interleave, shuffle, reverse, got"),

@@ -143,7 +143,7 @@ def test_other_settings_code_and_machines_are_named(pair, said):
 def test_what_is_no_run_is_an_error(pair, said, tmp_path):
     code, _, error = said(pair[0], tmp_path / "none")
 
-    assert code == 2 and f"{tmp_path / 'none'} holds no run: there is no run.jsonl" in error
+    assert code == 2 and f"{tmp_path / 'none'} holds no run: there is no such directory; name a run directory" in error
     assert said(*pair, "--bound", "0")[0] == 2
 
 

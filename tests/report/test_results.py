@@ -220,21 +220,28 @@ def test_agents_are_not_compared_in_what_follows_from_the_curriculum(tmp_path):
         comparisons(all_runs([tmp_path]), "optimal_performance")
 
 
-def test_one_run_twice_is_left_out_once_and_one_folder_twice_is_no_problem(tmp_path):
+def test_of_one_run_twice_a_finished_one_is_kept_and_one_folder_twice_is_no_problem(tmp_path):
     first = make_run(tmp_path, 0)
     assert len(all_runs([tmp_path, tmp_path])) == 1
     second = make_run(tmp_path, 0)
+    said = f"{first} and {second} are one run twice; "
 
     runs, problems = find_runs([tmp_path])
 
     assert [run.path for run in runs] == [first]
-    assert problems == [Problem(second, f"{first} and {second} are one run twice; the second is left out")]
+    assert problems == [Problem(second, f"{said}{second} is left out")]
+
+    (first / "metrics.json").unlink()
+    runs, problems = find_runs([tmp_path])
+
+    assert [run.path for run in runs] == [second]
+    assert problems == [Problem(first, f"{said}{first} is left out (unfinished)")]
 
 
 def test_a_folder_without_runs_is_a_problem(tmp_path):
     assert find_runs([tmp_path]) == (
         [],
-        [Problem(tmp_path, f"{tmp_path} holds no run: no run.jsonl in or below it")],
+        [Problem(tmp_path, f"{tmp_path} holds no run: no run.jsonl in or below it; name a run directory, or a folder that holds some")],
     )
 
 
@@ -330,7 +337,7 @@ def test_every_evaluation_is_a_row_of_a_tidy_table(tmp_path, monkeypatch, capsys
     [
         (["runs", "--tidy", "all.xlsx"], "a table of evaluations ends in .csv or .parquet, got all.xlsx"),
         (["empty"], "empty holds no run: no run.jsonl in or below it"),
-        (["nowhere"], "nowhere holds no run: there is no such directory"),
+        (["nowhere"], "nowhere holds no run: there is no such directory; name a run directory, or a folder that holds"),
         (["table.csv"], "table.csv holds no run: it is a file; name a run directory"),
         (["runs/0/metrics.json"], "it is a file; name a run directory, such as runs/0"),
         (["runs", "--compare", "average_performance"], "--compare needs two agents with the same seeds on one"),
@@ -350,6 +357,7 @@ def test_a_users_error_is_one_message(tmp_path, monkeypatch, capsys, arguments, 
 
     shown = capsys.readouterr()
     assert message in shown.err and shown.out == ""
+    assert shown.err.count("\n") == 1
 
 
 @pytest.mark.parametrize("name", [EXPERT, f"{EXPERT} (modified)"])
@@ -398,7 +406,7 @@ def test_one_seed_twice_in_a_folder_of_a_learner_without_a_name_is_left_out_with
 
     assert sorted((run.agent or "", run.seed) for run in runs) == [("", 0), ("PPO", 2)]
     assert why_left_out(problems) == (
-        f"{tmp_path}/mine and {tmp_path}/yours are both seed 0 of the learner of {tmp_path}, the second is left out: "
+        f"{tmp_path}/mine and {tmp_path}/yours are both seed 0 of the learner of {tmp_path}, {tmp_path}/yours is left out: "
         'learners need names, such as Recorder(..., about={"learner": "NAME"}), or separate folders'
     )
 

@@ -185,7 +185,7 @@ def test_bytes_that_are_no_text_are_refused_by_name(tmp_path):
 
 
 def test_a_missing_file_is_refused_by_name(tmp_path):
-    with pytest.raises(ValueError, match=r"missing\.json must be a JSON file that can be read"):
+    with pytest.raises(ValueError, match=r"missing\.json cannot be opened: no such file or directory; check the path"):
         Task.from_json(tmp_path / "missing.json", goal=(1, 1))
 
 
