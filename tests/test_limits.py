@@ -179,7 +179,7 @@ SMALL_LOGS = {
 @pytest.mark.parametrize("case", SMALL_LOGS)
 def test_a_small_log_makes_no_large_table(tmp_path, case):
     path = log_of(tmp_path / "run", *SMALL_LOGS[case])
-    rule = r"beyond what a file of its size can measure, 1,\d{3}: restore the log|is no run's: restore the log"
+    rule = r"beyond what a file of its size can measure, 1,\d{3}: restore the file|is no run's: restore the log"
 
     with pytest.raises(ValueError, match=rule):
         RunLog.read(path).performance()

@@ -30,7 +30,7 @@ from ctgraph_rl.board.rescore import RESCORED, Check, rescore
 from ctgraph_rl.board.submission import MOST_RUNS, VERIFICATION, Submission, read_submission
 from ctgraph_rl.board.two_samples import runs_needed
 from ctgraph_rl.checks import NamedValues, Rule, is_int, is_real, require
-from ctgraph_rl.disk import make_folder, write_whole
+from ctgraph_rl.disk import make_folder, read_regular, write_whole
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
 from ctgraph_rl.log.files import locked
 from ctgraph_rl.log.provenance import is_ours, machine, targets, versions
@@ -39,11 +39,15 @@ from ctgraph_rl.packages import check_packages
 from ctgraph_rl.parsers import LEVELS, LIMIT_TIMES
 from ctgraph_rl.portable import cpu_model
 from ctgraph_rl.runs.sweep import sigterm_exits
+from ctgraph_rl.strict import json_value
 
 NONE = "none"
 """The level of a submission that fails the first."""
 
 SCHEMA = 1
+
+MOST_BYTES = 2**24
+"""Largest ``verification.json``."""
 
 LEAST_SECONDS = 600
 """Least time limit of a process."""
@@ -258,6 +262,23 @@ def write_verification(submission: Submission, checks: Sequence[Check], plan: Pl
     return path
 
 
+def check_stored(submission: Submission, level: str) -> None:
+    """Refuse to replace a verification of the same files by one of a lower level.
+
+    Raises:
+        ValueError: names the file and its level.
+    """
+    path = submission.path / VERIFICATION
+    try:
+        found = json_value(read_regular(path, MOST_BYTES))
+    except (OSError, ValueError):
+        return
+    is_same = isinstance(found, dict) and found.get("digest") == submission.digest
+    stored = found.get("level") if is_same else NONE
+    lower = f"{path} has the level {stored}, --level {level} would replace it: verify a copy of the folder"
+    require((stored not in LEVELS[LEVELS.index(level) + 1 :], lower))
+
+
 def report(submission: Submission, checks: Sequence[Check]) -> str:
     """Return in words what a verification found."""
     wrong = [check for check in checks if not check.passed]
@@ -274,6 +295,7 @@ def report(submission: Submission, checks: Sequence[Check]) -> str:
 
 def verify(submission: Submission, arguments: argparse.Namespace) -> list[Check]:
     """Verify a submission to the level of the command line, say what will run, and write what was found."""
+    check_stored(submission, arguments.level)
     checks = rescore(submission)
     if arguments.level == RESCORED or not all(check.passed for check in checks):
         write_verification(submission, checks)

@@ -128,7 +128,7 @@ def check(measurement: ReadOnlyValues, most: int = MOST) -> None:
         (is_shallow(measurement, MAX_NESTING), f"nested more than {MAX_NESTING} deep"),
     )
     highest = max(_numbers(measurement), default=0)
-    rule = f"block or task {highest:,} is beyond what a file of its size can measure, {most:,}: restore the log"
+    rule = f"block or task {highest:,} is beyond what a file of its size can measure, {most:,}"
     require((highest <= most, rule))
 
 

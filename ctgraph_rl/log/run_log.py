@@ -62,6 +62,9 @@ FEW, BYTES_OF_A_NUMBER = 1000, 4
 FEW_CELLS, CELLS_OF_A_BYTE = 10**4, 16
 """Cells of a table of a log of any size, and more per file byte."""
 
+BROKEN = "restore the file, or run again"
+"""What to do about a broken line."""
+
 SCHEMA = 1
 """Rises when the meaning of a line changes; fields may be added without."""
 
@@ -197,7 +200,8 @@ class RunLog:
             try:
                 log.measurements.append(parsed(line))
             except ValueError as error:
-                raise ValueError(f"{path}: line {number} is no measurement; restore the file ({error})") from None
+                why = f"{error.msg} at character {error.pos + 1}" if isinstance(error, json.JSONDecodeError) else error
+                raise ValueError(f"{path}: line {number} is no measurement, {why}: {BROKEN}") from None
         if last:  # without an end: the run was killed while it wrote
             try:
                 log.measurements.append(parsed(last))
@@ -212,7 +216,7 @@ class RunLog:
             try:
                 check(measurement, most)
             except ValueError as error:
-                raise ValueError(f"{path}: line {number}: {error}") from None
+                raise ValueError(f"{path}: line {number}: {error}: {BROKEN}") from None
         for run in self.of_kind("run"):
             schema = run.get("schema", SCHEMA)
             newer = f"{path} has schema {schema}, this version reads {SCHEMA}: update ctgraph_rl"

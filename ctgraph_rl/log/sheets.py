@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from rich.console import Console
+from rich.cells import cell_len
+from rich.console import Console, JustifyMethod
 from rich.table import Table
 from rich.text import Text
 
@@ -54,7 +55,10 @@ def print_sheet(sheet: Sheet, console: Console | None = None) -> None:
     console = Console() if console is None else console
     table = Table(title=_shown(sheet.title), title_justify="left", caption_justify="left")
     for i, (name, side) in enumerate(sheet.columns.items()):
-        table.add_column(_shown(name), justify="right" if side == "r" else "left", no_wrap=i == 0 or side == "r")
+        is_whole = i == 0 or side == "r"
+        widest = max(cell_len(row[i]) for row in (tuple(sheet.columns), *sheet.rows)) if is_whole else None
+        justify: JustifyMethod = "right" if side == "r" else "left"
+        table.add_column(_shown(name), justify=justify, no_wrap=is_whole, min_width=widest)
     for row in sheet.rows:
         table.add_row(*map(_shown, row))
     if not console.is_terminal:

@@ -79,8 +79,8 @@ def collectives() -> ArgumentParser:
 def compare() -> ArgumentParser:
     """Say whether two runs are equal: all measurements but their times, and the agents' weights, bit for bit.
 
-    ctgraph-rl report and ctgraph-rl results compare agents. The exit code is 0 for equal runs, 1 for different ones, 3 for runs that are equal up to rounding, and 2 for
-    what is no run.
+    ctgraph-rl report and ctgraph-rl results compare agents. The exit code is 0 for equal runs, 1 for different ones,
+    3 for runs that are equal up to rounding, and 2 for what is no run.
     """
     parser = _parser(compare)
     _add(parser, "one", "a run directory", metavar="A")

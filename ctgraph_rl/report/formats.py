@@ -26,7 +26,8 @@ WIDTH = 80
 """Characters of a line on a terminal."""
 
 MEANS = "mean [95 % CI]"
-_EXACT = "solved seeds and median times [exact 95 % CI]"
+CI = "CI: confidence interval, which holds the true value in 95 of 100 such experiments"
+_EXACT = f"solved seeds and median times [exact 95 % CI]; {CI}"
 LEGEND = f"{MEANS}, {_EXACT}"
 
 LEGENDS = {

@@ -153,7 +153,7 @@ def write_report(
                 problems=problems,
                 code=[*mixed_code(runs), *code_notes(runs), *label_notes(runs)],
                 legend=formats.LEGEND,
-                legend_of_means=formats.MEANS,
+                legend_of_means=f"{formats.MEANS}; {formats.CI}",
                 definitions=[(name, which, formula, source) for which, (name, formula, source) in known.items()],
                 version=__version__,
                 missing=[run for run in runs if run.reason is not None],
@@ -234,7 +234,7 @@ def _numbers(section: Section, result: Result) -> dict[str, Table]:
                 complete = estimate.n in (0, len(result.finished))
                 cells.append(as_cell(estimate.shown if complete else f"{estimate.shown} n = {estimate.n}"))
             rows.append((str(block), cells))
-        caption = f"{section.name}, {result.agent} (n = {result.n}): {title}; {formats.MEANS}."
+        caption = f"{section.name}, {result.agent} (n = {result.n}): {title}; {formats.MEANS}; {formats.CI}."
         label = f"{section.name} {result.agent} {title}"
         tables[title] = Table(caption, label, "block", section.labels, rows)
     return tables

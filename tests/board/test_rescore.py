@@ -128,6 +128,12 @@ def test_the_command_writes_what_it_found_and_exits_with_1_where_something_diffe
     assert (first["versions"], first["machine"]) == (provenance.versions(), provenance.machine()["machine"])
     assert "all passed; level rescored" in capsys.readouterr().out
 
+    path = submission.path / "verification.json"
+    path.write_text(text.replace('"level": "rescored"', '"level": "rerun"', 1))
+    with pytest.raises(SystemExit, match="2"):
+        verify.main()
+    assert f"{path} has the level rerun, --level rescored would replace it" in capsys.readouterr().err
+
     edit(submission.path, lambda given: given["config"]["agent"].update(gamma=0.98))
     with pytest.raises(SystemExit, match="1"):
         verify.main()

@@ -125,7 +125,7 @@ def test_the_command_exports_a_run_directory(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("trained", "message"),
     [
-        (None, "holds no run: no run.jsonl in or below it"),
+        (None, "holds no run: no run.jsonl in it; name a run directory"),
         ((), "has no training and no evaluation yet: there is nothing to export"),
         (([1], [1, 2]), "lifelong metrics need blocks that train one task, block 2 trains several"),
     ],

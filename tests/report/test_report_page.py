@@ -308,7 +308,7 @@ def test_a_folder_without_a_run_is_one_message(tmp_path, monkeypatch, capsys):
     code, _, err = call(monkeypatch, capsys, tmp_path)
 
     assert code == 2
-    assert f"{tmp_path} holds no run: no run.jsonl in or below it" in err
+    assert f"{tmp_path} holds no run: no run.jsonl in or below it; name a run directory" in err
 
 
 @pytest.mark.parametrize("report", [False, True])

@@ -239,10 +239,9 @@ def test_of_one_run_twice_a_finished_one_is_kept_and_one_folder_twice_is_no_prob
 
 
 def test_a_folder_without_runs_is_a_problem(tmp_path):
-    assert find_runs([tmp_path]) == (
-        [],
-        [Problem(tmp_path, f"{tmp_path} holds no run: no run.jsonl in or below it; name a run directory, or a folder that holds some")],
-    )
+    reason = f"{tmp_path} holds no run: no run.jsonl in or below it; name a run directory, or a folder that holds some"
+
+    assert find_runs([tmp_path]) == ([], [Problem(tmp_path, reason)])
 
 
 def test_the_table_is_printed_and_written(tmp_path, monkeypatch, capsys):
@@ -264,7 +263,9 @@ def test_the_table_is_printed_and_written(tmp_path, monkeypatch, capsys):
 
     shown = capsys.readouterr().out
     assert "    average performance   0.81 [0.02, 1.61]    n = 2\n" in shown
-    assert "mean [95 % CI], solved seeds and median times [exact 95 % CI]" in shown
+    assert "mean [95 % CI], solved seeds and median times [exact 95 % CI]; CI: confidence interval, which" in " ".join(
+        shown.split()
+    )
     test = "sign-flip p = 0.5, Holm 0.5: not distinguishable with 2 seeds"
     seen = "6 would find such a difference with a chance of 80 %"
     sentence = f"better in 2, equal in 0, worse in 0; {test}; {seen}; 6 seeds find a difference of 0.25"
@@ -406,7 +407,8 @@ def test_one_seed_twice_in_a_folder_of_a_learner_without_a_name_is_left_out_with
 
     assert sorted((run.agent or "", run.seed) for run in runs) == [("", 0), ("PPO", 2)]
     assert why_left_out(problems) == (
-        f"{tmp_path}/mine and {tmp_path}/yours are both seed 0 of the learner of {tmp_path}, {tmp_path}/yours is left out: "
+        f"{tmp_path}/mine and {tmp_path}/yours are both seed 0 of the learner of {tmp_path}, "
+        f"{tmp_path}/yours is left out: "
         'learners need names, such as Recorder(..., about={"learner": "NAME"}), or separate folders'
     )
 
@@ -466,7 +468,7 @@ def test_an_agent_none_of_whose_runs_finished_is_one_row(tmp_path):
         ("every_metric", "- n = 0/1", "seed 0: unfinished; no seed has a value")
     ]
     assert selected(rows) == selected(rows, ["regret"]) == rows
-    assert formats.text(rows).splitlines()[4:] == [
+    assert formats.text(rows).splitlines()[5:] == [
         *("two", "  PPO", "    every metric  -  n = 0/1  (1)", "  (1) seed 0: unfinished; no seed has a value")
     ]
 

@@ -28,8 +28,6 @@ LEVELS = ("failed", "submitted", "rescored", "rerun", "held_out")
 OF_FILES = {"none": "failed", **{level: level for level in LEVELS[2:]}}
 """Levels by their names in ``verification.json``."""
 
-MOST_BYTES = 2**24
-
 FIELDS = (
     *("schema", "level", "bits", "digest", "number", "cells", "held_out_seeds", "isolation", "checks"),
     *("machine", "num_threads", "cpu", "versions"),
@@ -197,7 +195,7 @@ def verification_of(submission: Submission) -> Verification:
     if not path.is_file():
         return Verification("submitted")
     try:
-        found = json_value(read_regular(path, MOST_BYTES))
+        found = json_value(read_regular(path, verify.MOST_BYTES))
         _check_verification(found)
     except (OSError, ValueError) as error:
         why = f"{VERIFICATION} counts for nothing, {error}; verify the submission again"
