@@ -34,7 +34,7 @@ COMMANDS = {
     "collectives": Command(
         "ctgraph_rl.collective.__main__", "make a page of figures and tables of learners that share"
     ),
-    "compare": Command("ctgraph_rl.compare", "say whether two runs are equal, and what they differ in"),
+    "compare": Command("ctgraph_rl.compare", "say whether two runs are equal, bit for bit; report compares agents"),
     "curricula": Command("curricula.__main__", "list the curricula, or describe one"),
     "draw": Command("ctgraph_rl.play.pictures", "draw a task, and what a policy does there"),
     "export": Command("ctgraph_rl.log.export", "write a run in the format of another program"),
