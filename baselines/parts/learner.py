@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from typing import ClassVar
 
 import torch
@@ -10,12 +11,14 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from baselines.parts.live_ids import only_live_ids
 from baselines.parts.networks import Data, Items, TensorsByName
 from baselines.parts.units import Activations, activations
 from baselines.update.compiled import compiled
 from baselines.update.measured import finite_means, table_of
 from baselines.update.trained import Trained
 from baselines.update.update import take_step, update
+from ctgraph_rl.batch.specs import TASK_NUMBER
 from ctgraph_rl.checks import TakesNumbers, at_least_one, positive, require, true_or_false
 
 MOST_PASSES = 10**6  # over a batch, or gradient steps after it; more do not end
@@ -65,10 +68,21 @@ class Learner(TakesNumbers, Trained):
             FloatingPointError: names the first number that is not finite, or the largest weight.
         """
         steps = []
-        for minibatch in self.minibatches(batch):
-            measured = self.gradient_step(minibatch)
-            steps.append(self.after_update(measured))
-        return self.after_batch(self.means(list(steps[0]), table_of(steps))) if steps else {}
+        shown = self.shown_ids(batch)
+        with nullcontext() if shown is None else only_live_ids(self, shown):
+            for minibatch in self.minibatches(batch):
+                measured = self.gradient_step(minibatch)
+                steps.append(self.after_update(measured))
+            return self.after_batch(self.means(list(steps[0]), table_of(steps))) if steps else {}
+
+    def shown_ids(self, batch: TensorDictBase) -> Tensor | None:
+        """Return the numbers of all task ids that it reads while it learns from a batch, int64 [n]; None: reads none.
+
+        Numbers can be repeated, and -1 is none.
+        """
+        if TASK_NUMBER not in self.policy.in_keys:
+            return None
+        return torch.cat([batch[TASK_NUMBER].flatten(), batch["next", TASK_NUMBER].flatten()])
 
     def minibatches(self, batch: TensorDictBase) -> Iterator[Items]:
         """Yield minibatches, each for one gradient step, which is taken before the next is made."""

@@ -115,6 +115,7 @@ class Encoder(nn.Module):
         num_inputs = shape.numel() if self.convolutions is None else self.convolutions.num_features
         self.num_inputs = num_inputs
         self.num_ids = num_ids
+        self.live_ids: Tensor | None = None  # those whose columns the weight has, see `baselines.parts.live_ids`
         self.linear = linear_layer(num_inputs + num_ids + num_extra, num_features)
         self.relu = nn.ReLU()
         self.further = nn.Sequential()
@@ -150,12 +151,16 @@ class Encoder(nn.Module):
         inputs = joined(inputs, *others)
         if not self.num_ids:
             return self.further(self.relu(self.linear(inputs)))
+        num_columns = self.num_ids if self.live_ids is None else len(self.live_ids)
         of_inputs, of_ids, of_others = self.linear.weight.tensor_split(
-            [self.num_inputs, self.num_inputs + self.num_ids], dim=1
+            [self.num_inputs, self.num_inputs + num_columns], dim=1
         )
         weight = torch.cat([of_inputs, of_others], dim=1) if others else of_inputs
         number = extra[0].squeeze(-1)
-        of_number = of_ids.t().index_select(0, number.clamp(min=0).flatten()).unflatten(0, number.shape)
+        column = number.clamp(min=0).flatten()
+        if self.live_ids is not None:
+            column = torch.searchsorted(self.live_ids, column)
+        of_number = of_ids.t().index_select(0, column).unflatten(0, number.shape)
         hidden = nn.functional.linear(inputs, weight, self.linear.bias) + of_number * (extra[0] >= 0)
         return self.further(self.relu(hidden))
 

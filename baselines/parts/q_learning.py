@@ -23,6 +23,7 @@ from baselines.parts.networks import Data, Items, TensorsByName, guided, is_gree
 from baselines.parts.prioritized import PrioritySampler
 from baselines.update.measured import table_of
 from baselines.update.update import make_optimiser
+from ctgraph_rl.batch.specs import TASK_NUMBER
 from ctgraph_rl.checks import (
     NamedValues,
     at_least_one,
@@ -245,8 +246,10 @@ class QLearner(Learner):
 
     def with_targets(self, batch: TensorDictBase) -> TensorDictBase:
         """Return a batch with multi-step rewards, what follows them, and the steps that they span."""
+        read = "task_id" in self.policy.in_keys  # else it is long and would only be copied
+        used = batch if read else batch.exclude("task_id", ("next", "task_id"))
         with torchs_defaults():  # TorchRL's powers of the discount have torch's default dtype
-            return self.multi_step(batch)
+            return self.multi_step(used)
 
     def experience(self, batch: TensorDictBase) -> TensorDictBase:
         """Return what the replay buffer stores of a batch with multi-step rewards, [items]."""
@@ -264,6 +267,16 @@ class QLearner(Learner):
             for key, value in more.items():
                 items[key] = value.to(device)
             yield items
+
+    @override
+    def shown_ids(self, batch: TensorDictBase) -> Tensor | None:
+        """Those of the batch and of all that replay can give."""
+        shown = super().shown_ids(batch)
+        if shown is None or not len(self.replay):
+            return shown
+        stored = self.replay.storage._storage[: len(self.replay)]
+        columns = [value.flatten() for key, value in stored.items(True, True) if TASK_NUMBER in key]
+        return torch.cat([shown, *columns])
 
     def after_update(self, measured: TensorsByName) -> TensorsByName:
         """Set the priorities of replayed items, and copy the weights to the target network if due."""

@@ -1,0 +1,108 @@
+"""Learning with thousands of task ids, of which few are ever shown: without the weights of the others.
+
+Adam and RMSprop leave a weight as it is whose gradients were all 0. So a step changes only the columns of ids that were
+shown. A batch is learned with a matrix of these, which a step reads in a fraction of the time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor
+
+from baselines.parts.hooks import Hooks
+from baselines.parts.networks import Encoder, TensorsByName
+from baselines.update.trained import Trained
+from baselines.update.update import MOMENTS, has_parts
+
+MANY_IDS = 1024
+"""Ids from which those that are shown learn alone."""
+
+
+@contextmanager
+def only_live_ids(learner: Trained, shown: Tensor) -> Iterator[None]:
+    """Learn with the columns of ids that are shown or were; the encoders have all columns before and after.
+
+    On GPUs, compiled, with a method and with another optimiser they keep all columns, as these may change any.
+
+    Args:
+        shown: from `baselines.parts.learner.Learner.shown_ids`.
+    """
+    encoders = _encoders(learner) if _leaves_others(learner, shown) else []
+    if not encoders:
+        yield
+        return
+    live = torch.zeros(encoders[0].num_ids, dtype=torch.bool, device="cpu")
+    live[shown.clamp(min=0)] = True
+    tables = [_Table(encoder, learner.optimiser) for encoder in encoders]
+    for table in tables:
+        squares = table.moments.get(MOMENTS[type(learner.optimiser)][-1])
+        if squares is not None:
+            live |= table.of_ids(squares).sum(dim=0) != 0
+        if table is not tables[0]:  # what a target has not yet copied
+            live |= (table.of_ids(table.all_columns) != tables[0].of_ids(tables[0].all_columns)).any(dim=0)
+    try:
+        for table in tables:
+            table.narrow(live.nonzero().squeeze(1))
+        yield
+    finally:
+        for table in tables:
+            table.widen()
+
+
+def _leaves_others(learner: Trained, shown: Tensor) -> bool:
+    """Return whether steps leave weights without a gradient as they are."""
+    is_plain = type(learner.method) is Hooks and learner.compiled_step is None
+    return shown.is_cpu and is_plain and has_parts(learner.optimiser)
+
+
+def _encoders(learner: Trained) -> list[Encoder]:
+    """Return the encoders with many ids that the optimiser trains, and those of targets."""
+    found = []
+    for module in learner.modules():
+        if isinstance(module, Encoder) and module.num_ids >= MANY_IDS:
+            weight = module.linear.weight
+            if not weight.requires_grad or any(weight is other for other in learner.weights):
+                found.append(module)
+    return found
+
+
+class _Table:
+    """The first matrix of an encoder, with the optimiser's moments."""
+
+    def __init__(self, encoder: Encoder, optimiser: torch.optim.Optimizer) -> None:
+        self.encoder = encoder
+        self.weight = encoder.linear.weight
+        self.all_columns = self.weight.data
+        self.optimiser = optimiser
+        self.moments = self._moments()
+
+    def _moments(self) -> TensorsByName:
+        state = self.optimiser.state.get(self.weight, {})
+        return {key: value for key, value in state.items() if value.ndim == 2}
+
+    def of_ids(self, matrix: Tensor) -> Tensor:
+        """Return the columns of ids, [num_features, num_ids]."""
+        return matrix.narrow(1, self.encoder.num_inputs, self.encoder.num_ids)
+
+    def narrow(self, live: Tensor) -> None:
+        """Leave only the columns of live ids, int64 [n] in rising order."""
+        kept = torch.ones(self.weight.shape[1], dtype=torch.bool, device="cpu")
+        kept.narrow(0, self.encoder.num_inputs, self.encoder.num_ids).zero_()
+        kept[self.encoder.num_inputs + live] = True
+        self.columns = kept.nonzero().squeeze(1)
+        self.weight.data = self.all_columns.index_select(1, self.columns)
+        for key, value in self.moments.items():
+            self.optimiser.state[self.weight][key] = value.index_select(1, self.columns)
+        self.encoder.live_ids = live
+
+    def widen(self) -> None:
+        """Put back all columns."""
+        self.all_columns.index_copy_(1, self.columns, self.weight.data)
+        self.weight.data = self.all_columns
+        for key, value in self._moments().items():
+            whole = self.moments[key] if key in self.moments else torch.zeros_like(self.all_columns)
+            self.optimiser.state[self.weight][key] = whole.index_copy_(1, self.columns, value)
+        self.encoder.live_ids = None
