@@ -1,6 +1,6 @@
 """Learning with thousands of task ids, of which few are ever shown: without the weights of the others.
 
-Adam and RMSprop leave a weight as it is whose gradients were all 0. So a step changes only the columns of ids that were
+Adam and RMSprop change no weight whose gradients were all 0. So a step changes only the columns of ids that were
 shown. A batch is learned with a matrix of these, which a step reads in a fraction of the time.
 """
 
@@ -53,7 +53,7 @@ def only_live_ids(learner: Trained, shown: Tensor) -> Iterator[None]:
 
 
 def _leaves_others(learner: Trained, shown: Tensor) -> bool:
-    """Return whether steps leave weights without a gradient as they are."""
+    """Return whether steps change no weight without a gradient."""
     is_plain = type(learner.method) is Hooks and learner.compiled_step is None
     return shown.is_cpu and is_plain and has_parts(learner.optimiser)
 

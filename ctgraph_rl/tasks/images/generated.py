@@ -153,7 +153,7 @@ class GroupedImages(SquareImages):
         return _grouped_images(self)
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=64)
 def _paper_images(image_set: PaperImages) -> Tensor:
     candidates = image_set.num_images
     images = None
@@ -184,7 +184,7 @@ def _render(blueprints: Tensor, size: int) -> Tensor:
     return images
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=64)
 def _grouped_images(image_set: GroupedImages) -> Tensor:
     """Each group's first candidates that repeat no image; candidate k of all groups precedes k + 1."""
     groups = image_set.groups

@@ -100,7 +100,7 @@ class ReferenceOneHot(OneHot):
         return WHITE * torch.eye(self.num_images, self.num_images + 1, dtype=torch.uint8, device="cpu")
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=64)
 def _reference_images(image_set: ReferenceImages) -> Tensor:
     needed = image_set.num_images * image_set.size**2 * _BYTES_OF_A_PIXEL
     require_memory(f"{image_set.num_images:,} images while they are made", needed, "images")
