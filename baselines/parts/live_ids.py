@@ -18,7 +18,7 @@ from baselines.update.trained import Trained
 from baselines.update.update import MOMENTS, has_parts
 
 MANY_IDS = 1024
-"""Ids from which those that are shown learn alone."""
+"""Fewest ids of an encoder from which it learns without those that were never shown."""
 
 
 @contextmanager
