@@ -109,13 +109,14 @@ class CTGraphEnv(EnvBase):
         self.rows = Rows(
             tasks, seed, first_row, task_pool=task_pool, device=self.device, noise_bank=noise_bank, kernel=kernel
         )
-        ids = {} if task_ids is None else task_ids
-        numbers = torch.tensor([ids.get(task, -1) for task in self.rows.pool], device=self.device, dtype=torch.int64)
+        numbers = torch.zeros(0, device=self.device, dtype=torch.int64)
+        if task_ids is not None:
+            numbers = numbers.new_tensor([task_ids.get(task, -1) for task in self.rows.pool])
         self.register_buffer("_id_of_task", numbers, persistent=False)
         self._task_id: tuple[Tensor | None, RowData] = None, {}
         self._steps: list[TensorDictBase] | None = None
         self._running: RowData = {}
-        specs = make_specs(self.rows.pool, self.batch_size, self.num_task_ids, self.info)
+        specs = make_specs(self.rows.examples, self.batch_size, self.num_task_ids, self.info)
         self.observation_spec = specs.observation.to(self.device)
         self.action_spec = specs.action.to(self.device)
         self.reward_spec = reward_spec(self.batch_size).to(self.device)

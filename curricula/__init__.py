@@ -20,7 +20,7 @@ from ctgraph_rl.checks import nearest, takes_its_kinds
 if TYPE_CHECKING:
     from ctgraph_rl.tasks.curriculum import Curriculum
 
-_MODULES = ("adaptation", "gym", "masks", "memory", "paper", "profile", "sharing", "task_free")
+_MODULES = ("adaptation", "gym", "lives", "masks", "memory", "paper", "profile", "sharing", "task_free")
 """Modules whose ``NAMED`` has their curricula."""
 
 _HOMES = {

@@ -58,7 +58,7 @@ class MaskSC(SelectedMasks):
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         super().setup(agent, weights, curriculum)
         if self.selection in ORACLES[1:]:
-            ct_graphs(curriculum.tasks, f"selection={self.selection}")
+            ct_graphs(curriculum.examples, f"selection={self.selection}")
 
     @override
     def start_task(self, task: int | None) -> None:

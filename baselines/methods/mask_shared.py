@@ -45,7 +45,7 @@ class MaskShared(Masks):
 
     @override
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        self.num_actions = most_actions(curriculum.tasks)
+        self.num_actions = most_actions(curriculum.examples)
         self.betas = zero_betas(weights, self.max_received + 1)
         self._keep(torch.zeros(0, len(weights), dtype=torch.float32, device="cpu"))
         super().setup(agent, weights, curriculum)

@@ -61,7 +61,7 @@ class Method(TakesNumbers, Hooks):
         """
         protocol = curriculum.protocol
         name = type(self).__name__
-        several = multi_task_blocks(curriculum)
+        several = curriculum.blocks_of_several
         or_detector = "" if self.reads_tasks else ", or add a detector, such as detector=swoks"
         require(
             (
@@ -138,11 +138,6 @@ class Method(TakesNumbers, Hooks):
     def num_ids(self, curriculum: Curriculum) -> int:
         """Return the most different ids that tasks start with."""
         return len(curriculum.tasks) if self.max_labels is None else self.max_labels
-
-
-def multi_task_blocks(curriculum: Curriculum) -> list[int]:
-    """Return the numbers of the blocks with several tasks, from 1."""
-    return [number for number, block in enumerate(curriculum.blocks, 1) if len(set(block.tasks)) > 1]
 
 
 class TaskMethod(Method):

@@ -12,6 +12,7 @@ from torch import Tensor
 from ctgraph_rl.checks import are_ints, is_int, plain, require, require_all
 from ctgraph_rl.core import philox
 from ctgraph_rl.core.goal import Goal
+from ctgraph_rl.tasks.life import DrawnTasks
 from ctgraph_rl.tasks.protocol import MOST_IDS
 from ctgraph_rl.tasks.switch import Switch
 from ctgraph_rl.tasks.task import Task
@@ -37,13 +38,16 @@ def one_hot_ids(ids: Tensor, length: int) -> Tensor:
     return (ids.unsqueeze(-1) == torch.arange(length, device=ids.device)).to(torch.uint8)
 
 
-def find_numbers(pool: Iterable[Task], tasks: Iterable[Task]) -> list[int]:
+def find_numbers(pool: Sequence[Task], tasks: Iterable[Task]) -> list[int]:
     """Return the numbers of tasks in a pool.
 
     Raises:
         ValueError: for a task that is not in it.
     """
     tasks = require_all(Task, "tasks", tasks)
+    if isinstance(pool, DrawnTasks):
+        drawn = {task: pool.index(task) for task in dict.fromkeys(tasks)}
+        return [drawn[task] for task in tasks]
     number = {task: i for i, task in enumerate(pool)}
     unknown = [task for task in dict.fromkeys(tasks) if task not in number]
     require((not unknown, f"tasks must be in task_pool, got {unknown[:3]}; name them at construction"))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar
 
 import torch
@@ -22,6 +22,7 @@ from ctgraph_rl.core.kernel import is_available, is_traced
 from ctgraph_rl.core.row_params import RowParams
 from ctgraph_rl.core.tree import is_done
 from ctgraph_rl.tasks.images import white_level
+from ctgraph_rl.tasks.life import DrawnTasks
 from ctgraph_rl.tasks.switch import Switch, switch_rule
 from ctgraph_rl.tasks.task import Task
 
@@ -80,7 +81,11 @@ class Rows(TakesNumbers, nn.Module):
         kernel: str = "auto",
     ) -> None:
         tasks = require_all(Task, "tasks", tasks)
-        self.pool = tuple(dict.fromkeys(tasks if task_pool is None else require_all(Task, "task_pool", task_pool)))
+        if isinstance(task_pool, DrawnTasks):
+            self.pool: Sequence[Task] = task_pool
+            self.examples = task_pool.examples
+        else:
+            self.pool = self.examples = _different(tasks if task_pool is None else task_pool)
         self.num_rows = len(tasks)
         require(
             seed_rule(seed),
@@ -91,17 +96,16 @@ class Rows(TakesNumbers, nn.Module):
         device = None if device is None else checked_device(device)
         super().__init__()
         self.kernel = kernel
-        self.max_branching = max(task.graph.branching_factor for task in self.pool)
+        self.max_branching = max(task.graph.branching_factor for task in self.examples)
         self.register_buffer("seed", torch.tensor([seed], device=device, dtype=torch.int64))
         self.register_buffer("row", torch.arange(first_row, first_row + self.num_rows, device=device))
         self._choose_engine()
-        bank = make_shared_bank(self.pool, self.num_rows, noise_bank)
-        no_images = bank.images.new_empty(0, *bank.shape)
-        self._bank = bank._replace(images=no_images, noises=no_images)
-        self.image_shape = bank.shape
-        self.white = max(int(white_level(task.images)) for task in self.pool)
-        self.register_buffer("bank", bank.images.to(device), persistent=False)
-        self.register_buffer("noises", bank.noises.to(device), persistent=False)
+        self.register_buffer("bank", None, persistent=False)
+        self.register_buffer("noises", None, persistent=False)
+        self._noise_bank = noise_bank
+        self._fill_bank(self.examples)
+        self.image_shape = self._bank.shape
+        self.white = max(int(white_level(task.images)) for task in self.examples)
         self.register_buffer("normal_table", philox.normal_table().to(device), persistent=False)
         zeros = torch.zeros(self.num_rows, dtype=torch.int64, device=device)
         for field, dtype in dynamics.STATE_DTYPES.items():
@@ -118,7 +122,7 @@ class Rows(TakesNumbers, nn.Module):
         return self.row.device
 
     def _choose_engine(self) -> None:
-        reward_fns = [task.reward_fn for task in self.pool]
+        reward_fns = [task.reward_fn for task in self.examples]
         if self.kernel == "required":
             require_kernel(reward_fns, self.device)
         self._kernel_fits = self.kernel == "auto" and type(self.row) is Tensor and knows(reward_fns, self.device)
@@ -205,9 +209,18 @@ class Rows(TakesNumbers, nn.Module):
         self._make_tables()
         self._end_episodes()
 
+    def _fill_bank(self, tasks: tuple[Task, ...]) -> None:
+        bank = make_shared_bank(tasks, self.num_rows, self._noise_bank)
+        no_images = bank.images.new_empty(0, *bank.shape)
+        self._bank = bank._replace(images=no_images, noises=no_images)
+        self.bank = bank.images.to(self.device)
+        self.noises = bank.noises.to(self.device)
+
     def _make_tables(self) -> None:
         number = self.assignment.in_use
         tasks = tuple(self.pool[i] for i in number.tolist())
+        if self.pool is not self.examples:
+            self._fill_bank((*self.examples, *tasks))
         self.tables = make_tables(tasks, number, self._bank)
         self.uses = self.tables.uses
         self._take_params()
@@ -384,6 +397,10 @@ class Rows(TakesNumbers, nn.Module):
         self._take_params()
         self._choose_engine()
         return self
+
+
+def _different(tasks: Iterable[Task]) -> tuple[Task, ...]:
+    return tuple(dict.fromkeys(require_all(Task, "task_pool", tasks)))
 
 
 _ASSIGNED = ("task", "choice", "episodes")

@@ -59,7 +59,7 @@ def make_env(
     """
     pool, length = _pool_and_ids(curriculum)
     task_ids = curriculum.task_ids if length else None
-    kind = type(pool[0])
+    kind = type(curriculum.examples[0])
     env = kind.make_env(tasks, seed, task_pool=pool, device=device, task_ids=task_ids, num_task_ids=length or None)
     if not isinstance(env, CTGraphEnv):
         try:
@@ -90,8 +90,8 @@ def agent_specs(curriculum: Curriculum) -> Specs:
         ValueError: if the tasks cannot be rows of one environment.
     """
     pool, length = _pool_and_ids(curriculum)
-    if are_graphs(pool):
-        return make_specs(pool, num_task_ids=length)
+    if are_graphs(curriculum.examples):
+        return make_specs((*curriculum.examples, *curriculum.evaluation.held_out), num_task_ids=length)
     env = make_env(curriculum, pool[:1], 0)
     try:
         return Specs(env.observation_spec_unbatched, env.action_spec_unbatched)
@@ -99,10 +99,11 @@ def agent_specs(curriculum: Curriculum) -> Specs:
         close_env(env)
 
 
-def _pool_and_ids(curriculum: Curriculum) -> tuple[tuple[TaskLike, ...], int]:
+def _pool_and_ids(curriculum: Curriculum) -> tuple[Sequence[TaskLike], int]:
     """Return all tasks, held-out ones too, and the length of shown task ids, or 0."""
     how = curriculum.protocol
-    pool = (*curriculum.tasks, *curriculum.evaluation.held_out)
+    held_out = curriculum.evaluation.held_out
+    pool = (*curriculum.tasks, *held_out) if held_out else curriculum.tasks
     return pool, how.length(len(curriculum.tasks)) if how.task_id == "one_hot" else 0
 
 

@@ -31,6 +31,7 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.task_like import TaskLike, close_env, require_tasks
 from ctgraph_rl.tasks.protocol import Evaluation
 from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.tasks.values import Measures
 
 
 @torch.no_grad()
@@ -185,13 +186,22 @@ class Evaluator:
         curriculum: says when and how.
         seed: of the run; each evaluation derives one.
         device: of the environments.
+        untrained: the agent's policy before any training, which a stream evaluates on each new task, too.
     """
 
-    def __init__(self, curriculum: Curriculum, seed: int, log: RunLog, device: torch.device | str = "cpu") -> None:
+    def __init__(
+        self,
+        curriculum: Curriculum,
+        seed: int,
+        log: RunLog,
+        device: torch.device | str = "cpu",
+        untrained: Policy | None = None,
+    ) -> None:
         self.curriculum = curriculum
         self.seed = seed
         self.log = log
         self.device = device
+        self.untrained = untrained
 
     def evaluate_if_due(self, agent: Agent, frames: int) -> None:
         """Evaluate an agent if the curriculum evaluates after ``frames`` frames of the run."""
@@ -241,8 +251,9 @@ class Evaluator:
     ) -> None:
         curriculum = self.curriculum
         shape = agent_specs(curriculum).observation["observation"].shape
-        for (task, named), policy in zip(self.tasks_at(frames).items(), policies, strict=True):
-            measures = exact_measures(
+
+        def measure(policy: Policy, task: TaskLike) -> Measures:
+            return exact_measures(
                 policy,
                 task,
                 greedy=curriculum.evaluation.greedy,
@@ -250,7 +261,13 @@ class Evaluator:
                 task_id=shown_id(curriculum, task),
                 shape=shape,
             )
-            self._append(named, frames, moment)("evaluation", episodes=None, **vars(measures), exact=True)
+
+        for (task, named), policy in zip(self.tasks_at(frames).items(), policies, strict=True):
+            untrained = {}
+            if self.untrained is not None and named[0] == curriculum.block_at(frames) + 1 > 1:  # the next, a new one
+                untrained["untrained_return"] = measure(self.untrained, task).return_mean
+            append = self._append(named, frames, moment)
+            append("evaluation", episodes=None, **vars(measure(policy, task)), exact=True, **untrained)
 
     def _append(self, named: tuple[int, str], frames: int, moment: str) -> Callable[..., None]:
         number, label = named
@@ -267,13 +284,7 @@ class Evaluator:
 
     def tasks_at(self, frames: int) -> dict[TaskLike, tuple[int, str]]:
         """Return the tasks to evaluate after ``frames`` frames, with their numbers and labels."""
-        curriculum = self.curriculum
-        evaluated = *curriculum.tasks, *curriculum.evaluation.held_out
-        named = dict(zip(evaluated, enumerate(curriculum.evaluated_labels, 1), strict=True))
-        if curriculum.evaluation.tasks == "all":
-            return named
-        seen = {i + 1 for block in curriculum.trained[: curriculum.block_at(frames)] for i in block}
-        return {task: name for task, name in named.items() if name[0] in seen or name[0] > len(curriculum.tasks)}
+        return self.curriculum.evaluated(frames)
 
 
 def _join_policies(agent: Agent, policies: Sequence[Policy]) -> Policy:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from copy import deepcopy
 from functools import partial
 from typing import Any, Protocol
 
@@ -24,7 +25,7 @@ from ctgraph_rl.learn.refusals import check_adaptation, check_env, check_exact, 
 from ctgraph_rl.learn.segments import Segment, announced_id, collect_segment, guided, log_training, segments
 from ctgraph_rl.learn.unit_metrics import UnitMeter, norms, weights_of
 from ctgraph_rl.log.run_log import RunLog
-from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.curriculum import Curriculum, Stream
 from ctgraph_rl.tasks.kinds.task_like import close_env
 
 SavedState = ReadOnlyValues
@@ -197,7 +198,10 @@ class Lockstep:
                 self.meters.append(UnitMeter(curriculum, agent, log, log_units))
         self.env = self._make_env(device)
         self.can_resume = True
-        self.evaluators = [Evaluator(curriculum, seed, log, device) for seed, log in zip(seeds, logs, strict=True)]
+        self.evaluators = []
+        for agent, seed, log in zip(group.agents, seeds, logs, strict=True):
+            untrained = deepcopy(agent.policy) if isinstance(curriculum, Stream) else None
+            self.evaluators.append(Evaluator(curriculum, seed, log, device, untrained))
         self.frames: int = 0 if saved is None else saved[0]["frames"]
         self.failed: dict[int, FloatingPointError] = {}
         """Errors of failed members by their position."""

@@ -25,10 +25,10 @@ def check_rows(curriculum: Curriculum, num_envs: int) -> None:
         ValueError: names the block and the nearest possible frames, or the tasks that cannot share the rows.
     """
     evaluation = curriculum.evaluation
-    evaluation.check((*curriculum.tasks, *evaluation.held_out))
+    evaluation.check((*curriculum.examples, *evaluation.held_out))
     rules: dict[Any, Rule] = {"every": evaluation.every_rule(num_envs)}
     alike: dict[int, list[str]] = {}
-    for number, block in enumerate(curriculum.blocks, 1):
+    for number, block in enumerate(curriculum.example_blocks, 1):
         block.rows(num_envs)
         numbers = alike.setdefault(block.num_frames, [])
         numbers.append(str(number))
@@ -38,7 +38,7 @@ def check_rows(curriculum: Curriculum, num_envs: int) -> None:
 
 def resumes(curriculum: Curriculum) -> bool:
     """Return whether environments of all tasks can be saved within an episode."""
-    return all(getattr(task, "resumes", False) for task in curriculum.tasks)
+    return all(getattr(task, "resumes", False) for task in curriculum.examples)
 
 
 def check_env(curriculum: Curriculum, env: EnvBase) -> None:
@@ -47,8 +47,8 @@ def check_env(curriculum: Curriculum, env: EnvBase) -> None:
     Raises:
         ValueError: for a switch within a block, or a guide.
     """
-    kind = type(curriculum.tasks[0]).__name__
-    switches = any(block.switch is not None for block in curriculum.blocks)
+    kind = type(curriculum.examples[0]).__name__
+    switches = any(block.switch is not None for block in curriculum.example_blocks)
     guide = f"protocol.guide_frames={curriculum.protocol.guide_frames} needs CT-graphs, not {kind}: set it to 0"
     switch = f"a block with a switch needs an environment with switch_tasks, which {kind} has not: leave it out"
     require(
@@ -74,7 +74,7 @@ def check_exact(curriculum: Curriculum, agent: Agent) -> None:
     if not curriculum.evaluation.exact:
         return
     start = dict(agent.initial_state(1).items())
-    for task in (*curriculum.tasks, *curriculum.evaluation.held_out):
+    for task in (*curriculum.examples, *curriculum.evaluation.held_out):
         for rule in exact_rules(agent.policy, task, start, type(agent).__name__):
             require(rule)
 
@@ -93,13 +93,13 @@ def check_adaptation(curriculum: Curriculum, agent: Agent) -> None:
     how = curriculum.evaluation
     row = f"rows of an evaluation have {how.row_episodes} episodes, and {name} adapts after {needed}"
     without = []
-    for number, block in enumerate(curriculum.blocks, 1):
+    for number, block in enumerate(curriculum.example_blocks, 1):
         if len(set(block.tasks)) == 1 and getattr(block.tasks[0], "goal_change", None) is None:
             without.append(str(number))
     one = f"{name} learns to adapt to tasks that are drawn, and block {', '.join(without)} has one task"
     steps = 0
     if getattr(agent, "needs_whole_trials", False):
-        lengths = [task.graph.expected_episode_length for task in curriculum.tasks if isinstance(task, Task)]
+        lengths = [task.graph.expected_episode_length for task in curriculum.examples if isinstance(task, Task)]
         steps = math.ceil(agent.trial_episodes * max(lengths, default=0))  # type: ignore[attr-defined]
     trial = f"a trial of {getattr(agent, 'trial_episodes', 0)} episodes that reach an end takes {steps} steps"
     cut = f"num_steps={agent.num_steps} of {name}: {trial}, and {name} learns from whole trials in a batch"
@@ -112,10 +112,10 @@ def check_adaptation(curriculum: Curriculum, agent: Agent) -> None:
 
 def notes(curriculum: Curriculum) -> Iterator[str]:
     """Yield what to know of a curriculum before a run."""
-    rewards = {type(task.reward_fn) for task in curriculum.tasks if isinstance(task, Task)}
+    rewards = {type(task.reward_fn) for task in curriculum.examples if isinstance(task, Task)}
     slow = sorted(kind.__name__ for kind in rewards - {*KERNEL_REWARDS})
     if slow:
         yield f"the C kernel does not know {', '.join(slow)}: steps take the tensor engine, which is slower"
     if not resumes(curriculum):
-        kind = type(curriculum.tasks[0]).__name__
+        kind = type(curriculum.examples[0]).__name__
         yield f"{kind} cannot be saved within an episode: a run that is stopped resumes from its last announced block"

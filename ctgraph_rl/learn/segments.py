@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from itertools import accumulate, pairwise
+from itertools import pairwise
 from typing import NamedTuple
 
 from tensordict import TensorDictBase
@@ -23,22 +23,27 @@ class Segment(NamedTuple):
     """Blocks with no announced boundary between them."""
 
     start: int  # frames of the run before it
-    blocks: tuple[Block, ...]
+    blocks: Sequence[Block]
+    ends: Sequence[int]  # frames of the run at the end of each block
 
     @property
     def end(self) -> int:
         """Frames of the run at its end."""
-        return self.start + sum(block.num_frames for block in self.blocks)
+        return self.ends[-1]
+
+    def block_at(self, frames: int) -> Block:
+        """Return the block that comes after ``frames`` frames of the run; at the end the last."""
+        return self.blocks[bisect_right(self.ends, frames, hi=len(self.ends) - 1)]
 
 
 def segments(curriculum: Curriculum, frames: int) -> Iterator[Segment]:
     """Yield the segments that end at or after ``frames`` frames of the run."""
-    start = 0
-    for blocks in curriculum.segments:
-        segment = Segment(start, blocks)
-        if frames <= segment.end:
-            yield segment
-        start = segment.end
+    if not curriculum.protocol.announces:
+        yield Segment(0, curriculum.blocks, curriculum.ends)
+        return
+    for number in range(max(curriculum.block_at(frames), 1), len(curriculum.blocks) + 1):
+        start = curriculum.ends[number - 2] if number > 1 else 0
+        yield Segment(start, curriculum.blocks[number - 1 : number], curriculum.ends[number - 1 : number])
 
 
 def collect_segment(
@@ -66,9 +71,7 @@ def collect_segment(
         num_seeds: seeds that share the rows equally.
         guide_frames: see `ctgraph_rl.tasks.protocol.Protocol`; only with one seed.
     """
-    ends = list(accumulate(block.num_frames for block in segment.blocks))
-    following = dict(zip(ends, segment.blocks[1:], strict=False))
-    _set_tasks(env, segment.blocks[bisect_right(ends[:-1], done)], num_seeds)
+    _set_tasks(env, segment.block_at(segment.start + done), num_seeds)
     carried = None if restore is None else restore()
     num_rows = env.numel() // num_seeds
     guide = Guide(policy, env, guide_frames) if done < guide_frames else None
@@ -79,14 +82,14 @@ def collect_segment(
             guide.frames = frames
         if frames:
             evaluate(segment.start + frames)
-        next_end = frames + num_rows
-        if next_end in following:  # so that a row whose episode ends with the block does not begin another of its task
-            _set_tasks(env, following[next_end], num_seeds, at_episode_end=True)
+        following = segment.start + frames + num_rows
+        if following in segment.ends[:-1]:  # so that a row whose episode ends with the block begins none of its task
+            _set_tasks(env, segment.block_at(following), num_seeds, at_episode_end=True)
 
     return batches(
         env,
         policy if guide is None else guide,
-        num_seeds * ends[-1],
+        num_seeds * (segment.end - segment.start),
         agent.num_steps,
         agent.initial_state,
         between_steps=between_steps,

@@ -11,7 +11,7 @@ from ctgraph_rl.checks import NamedValues, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.learn.loop import Group, Lockstep, Progress, SavedState, run_loop
 from ctgraph_rl.log.run_log import RunLog
-from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.curriculum import Curriculum, Stream
 from ctgraph_rl.tasks.task import are_graphs
 
 OfferCheckpoints = Callable[[Callable[[], list[NamedValues]], bool], object]
@@ -20,10 +20,12 @@ OfferCheckpoints = Callable[[Callable[[], list[NamedValues]], bool], object]
 
 def why_not_together(curriculum: Curriculum) -> str | None:
     """Return why seeds cannot learn a curriculum in one environment, if they cannot."""
-    kind = type(curriculum.tasks[0]).__name__
-    if not are_graphs(curriculum.tasks):
+    kind = type(curriculum.examples[0]).__name__
+    if not are_graphs(curriculum.examples):
         return f"the rows of {kind} cannot draw from the streams of several seeds, as those of CT-graphs can"
-    shared = any(block.switch is not None and block.switch.together for block in curriculum.blocks)
+    shared = any(block.switch is not None and block.switch.together for block in curriculum.example_blocks)
+    if isinstance(curriculum, Stream) and curriculum.blocks.seed is None:
+        return "each seed draws its own tasks: give curriculum.seed=0, and all learn one life"
     if curriculum.protocol.guide_frames:
         return "a guide draws from the generator of one seed"
     return "its blocks change the tasks of all rows at once" if shared else None

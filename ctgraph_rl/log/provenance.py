@@ -20,7 +20,7 @@ from ctgraph_rl.log.run_log import SCHEMA
 from ctgraph_rl.log.sources import OURS, find_sources
 from ctgraph_rl.packages import check_packages
 from ctgraph_rl.portable import cpu_model, is_portable
-from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.curriculum import Curriculum, Stream
 
 NUMBERS = 2
 """Numbers version: rises when equal configurations and seeds give other weights or measurements.
@@ -65,14 +65,17 @@ def provenance(curriculum: Curriculum, names: Iterable[str] | None = ()) -> Name
     """Return curriculum, code, versions and machine as plain values for JSON; tasks count from 1. ``names`` are as in
     `code`.
     """
+    tasks: NamedValues = {}
+    if not isinstance(curriculum, Stream):  # whose tasks are drawn when they are needed
+        tasks["tasks"] = list(curriculum.labels)
+        tasks["trained"] = [[number + 1 for number in block] for block in curriculum.trained]
     return {
         "schema": SCHEMA,
         "curriculum": name_in_logs(curriculum),
         "version": curriculum.version,
         "source": curriculum.source,
         **code(curriculum, names),
-        "tasks": list(curriculum.labels),
-        "trained": [[number + 1 for number in block] for block in curriculum.trained],
+        **tasks,
         "num_frames": curriculum.num_frames,
         "versions": versions(),
         **machine(),

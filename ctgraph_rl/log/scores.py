@@ -14,13 +14,14 @@ from torch import Tensor
 from ctgraph_rl import metrics
 from ctgraph_rl.checks import NamedValues, require
 from ctgraph_rl.log.escape import listed
+from ctgraph_rl.log.life_curves import life_inputs
 from ctgraph_rl.log.run_log import RunLog, tuning_share
 from ctgraph_rl.metrics import Curves, Metric, Undefined
 from ctgraph_rl.metrics.adaptation import Adaptation
 from ctgraph_rl.metrics.inputs import INPUTS, OF_A_PART
 from ctgraph_rl.metrics.labels import SEVERAL, Labelling
 from ctgraph_rl.metrics.record import float64
-from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.curriculum import Curriculum, Stream
 from ctgraph_rl.tasks.kinds.task_like import TaskLike
 from ctgraph_rl.tasks.observability import POLICIES, state_entropy
 from ctgraph_rl.tasks.protocol import Evaluation
@@ -34,6 +35,7 @@ from ctgraph_rl.tasks.values import (
 )
 
 GOAL_CHANGES = Undefined("ceilings are exact only for goals that stay, and a task has a goal_change")
+NO_STREAM = Undefined("windows are those of a stream, as curriculum=stream makes")
 NO_EXPERTS = "no experts were given"
 AT_MOMENTS = "evaluate exactly where Curriculum.moments says"
 MOST_MOMENTS = 5
@@ -62,6 +64,8 @@ def scores(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None
         '1/(T-1) sum_{j=1..T-1} (R[T,j] - R[j,j])'
     """
     _check_same(log, curriculum)
+    if isinstance(curriculum, Stream):
+        return metrics.of_inputs(life_inputs(log, curriculum))
     count = len(curriculum.tasks)
     given = experts is None or len(experts) == count
     require((given, f"experts must be one log for each of {count} tasks, got {len(experts or ())}"))
@@ -78,7 +82,7 @@ def inputs_of(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | N
     if share is not None and share < 1:
         reason = Undefined(f"a tuning run ends after {share:g} of the frames, and has only metrics of training")
         found = _training(log, curriculum, facts["best"], curriculum.frames_of(share))
-        known = {name: found[name] for name in OF_A_PART}
+        known = {name: found[name] for name in OF_A_PART if name in found}
         return {name: facts.get(name, known.get(name, reason)) for name in INPUTS}
     try:
         check_finished(log, curriculum)
@@ -126,6 +130,7 @@ def _facts(curriculum: Curriculum) -> NamedValues:
         "evaluation_noise": float64([evaluation_noise(task, curriculum.evaluation) for task in tasks]),
         "best": optimal_values(tasks),
         "zero": lowest_returns(tasks),
+        "life": NO_STREAM,
     }
     if not are_graphs(tasks):
         reason = Undefined(f"it is known of CT-graphs alone, and tasks are of {_kind(tasks)}")

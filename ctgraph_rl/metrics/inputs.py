@@ -27,6 +27,7 @@ INPUTS = {
     "search_episodes": "for each task, E[kappa], the mean episodes of a search without repetition",
     "adaptation": "the last evaluation with adaptation on trained tasks, `Adaptation`",
     "held_out_adaptation": "the same on held-out tasks",
+    "life": "a stream's life by blocks, `LifeCurves`",
     "regimes": "stays on one task, each a `Regime`, on the scale 1..101",
     "experts": "for each task, the training curves of its experts, on that scale",
     "areas": "each task's area under its curve over its own block, float64 [tasks]",
@@ -36,5 +37,5 @@ INPUTS = {
 }
 """By name; `ctgraph_rl.log.scores` gives them, or the reason why a run has none."""
 
-OF_A_PART = ("episodes", "returns", "interval_best", "labelling")
+OF_A_PART = ("episodes", "returns", "interval_best", "labelling", "life")
 """Those that a tuning run has, which ends after a part of the frames."""

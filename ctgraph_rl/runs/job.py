@@ -498,7 +498,7 @@ def curriculum_of(cfg: DictConfig, method: MethodLike) -> Curriculum:
     Raises:
         ValueError: for values out of range.
     """
-    return method.prepare(with_changes(config.target(cfg, "curriculum")(), cfg))
+    return method.prepare(with_changes(config.target(cfg, "curriculum")(), cfg).for_seed(cfg.seed))
 
 
 def with_changes(curriculum: Curriculum, cfg: DictConfig) -> Curriculum:

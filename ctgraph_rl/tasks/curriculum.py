@@ -8,7 +8,7 @@ import math
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from fractions import Fraction
 from functools import cached_property
 from html import escape
@@ -27,6 +27,7 @@ from ctgraph_rl.checks import (
 )
 from ctgraph_rl.tasks.curriculum_json import read_curriculum, type_name, write_curriculum
 from ctgraph_rl.tasks.kinds.task_like import TaskLike, are_tasks
+from ctgraph_rl.tasks.life import DrawnTasks, Lazy, Life
 from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
 from ctgraph_rl.tasks.task import Task, are_graphs
 
@@ -68,8 +69,11 @@ class Curriculum:
 
     def __post_init__(self) -> None:
         make_fields_plain(self)
-        blocks = self.blocks
-        only_blocks = isinstance(blocks, tuple) and bool(blocks) and all(isinstance(each, Block) for each in blocks)
+        only_blocks = isinstance(self.blocks, tuple) and bool(self.blocks)
+        only_blocks = only_blocks and all(isinstance(each, Block) for each in self.blocks)
+        self._check(only_blocks)
+
+    def _check(self, only_blocks: bool) -> None:
         require(
             (isinstance(self.name, str) and bool(self.name), f"a curriculum needs a name, got {self.name!r}"),
             (is_int(self.version, 1), f"version must be an integer >= 1, got {self.version!r}"),
@@ -79,15 +83,15 @@ class Curriculum:
             (isinstance(self.protocol, Protocol), f"protocol must be a Protocol, got {self.protocol!r}"),
         )
         self.protocol.ids(len(self.tasks))
-        everything = (*self.tasks, *self.evaluation.held_out)
+        everything = (*self.examples, *self.evaluation.held_out)
         require(*are_tasks("tasks", everything))
         shapes = list(dict.fromkeys(task.observation_shape for task in everything))
         actions = list(dict.fromkeys(task.num_actions for task in everything))
         pads = are_graphs(everything)
         one_shape = len(shapes) == 1 or (pads and max(map(len, shapes)) == 1)
-        trained = set(self.tasks)
+        trained = set(self.examples)
         trained_too = [task for task in self.evaluation.held_out if task in trained]
-        one_each = self.protocol.task_id != "at_boundaries" or max(map(len, self.trained)) == 1
+        one_each = self.protocol.task_id != "at_boundaries" or not self.blocks_of_several
         how = self.evaluation
         at_once = how.before and (how.tasks == "all" or bool(how.held_out))
         evaluates = how.at_block_ends or at_once or 0 < how.every <= self.num_frames
@@ -104,10 +108,9 @@ class Curriculum:
         return f"<Curriculum {self._summary}>"
 
     def _repr_html_(self) -> str:
-        labels = dict(zip(self.tasks, self.labels, strict=True))
         rows = ["<tr><th>block</th><th>tasks</th><th>b, d, p</th><th>frames</th></tr>"]
         for number, block in enumerate(self.blocks[:SHOWN], 1):
-            names = [labels[task] for task in dict.fromkeys(block.tasks)]
+            names = [self.labels[task] for task in self.trained[number - 1]]
             graphs = dict.fromkeys(task.graph for task in block.tasks if isinstance(task, Task))
             shapes = [f"{graph.branching_factor}, {graph.depth}, {graph.wait_prob:g}" for graph in graphs]
             cells = (str(number), _some(names), _some(shapes, "; "), f"{block.num_frames:,}")
@@ -122,9 +125,37 @@ class Curriculum:
         return f"{self.name!r}, version {self.version}, {sizes}"
 
     @cached_property
-    def tasks(self) -> tuple[TaskLike, ...]:
+    def tasks(self) -> Sequence[TaskLike]:
         """The different tasks, by first appearance."""
         return tuple(dict.fromkeys(task for block in self.blocks for task in block.tasks))
+
+    @property
+    def examples(self) -> tuple[TaskLike, ...]:
+        """Tasks that have all graphs, rewards and kinds of images: ``tasks``."""
+        return tuple(self.tasks)
+
+    @property
+    def example_blocks(self) -> Sequence[Block]:
+        """Blocks that have all lengths, switches and numbers of tasks: ``blocks``."""
+        return self.blocks
+
+    @property
+    def blocks_of_several(self) -> list[int]:
+        """The numbers, from 1, of the blocks with several tasks."""
+        return [number for number, block in enumerate(self.example_blocks, 1) if len(set(block.tasks)) > 1]
+
+    def for_seed(self, seed: int) -> Curriculum:
+        """Return the curriculum of a run with this seed: the same for all."""
+        return self
+
+    def evaluated(self, frames: int) -> dict[TaskLike, tuple[int, str]]:
+        """Return the tasks to evaluate after ``frames`` frames, with their numbers, from 1, and labels."""
+        everything = *self.tasks, *self.evaluation.held_out
+        named = dict(zip(everything, enumerate(self.evaluated_labels, 1), strict=True))
+        if self.evaluation.tasks == "all":
+            return named
+        seen = {i + 1 for block in self.trained[: self.block_at(frames)] for i in block}
+        return {task: name for task, name in named.items() if name[0] in seen or name[0] > len(self.tasks)}
 
     @cached_property
     def num_frames(self) -> int:
@@ -132,7 +163,7 @@ class Curriculum:
         return self.ends[-1]
 
     @cached_property
-    def ends(self) -> tuple[int, ...]:
+    def ends(self) -> Sequence[int]:
         """Frames of the run at each block's end."""
         return tuple(accumulate(block.num_frames for block in self.blocks))
 
@@ -167,22 +198,17 @@ class Curriculum:
         return tuple(filter(self.moment, sorted({0, *self.ends, *within})))
 
     @property
-    def segments(self) -> tuple[tuple[Block, ...], ...]:
-        """The blocks between announced boundaries: each separately, or all where boundaries are hidden."""
-        return tuple((block,) for block in self.blocks) if self.protocol.announces else (self.blocks,)
-
-    @property
     def task_ids(self) -> dict[TaskLike, int]:
         """The id of each of ``tasks``."""
         return dict(zip(self.tasks, self.protocol.ids(len(self.tasks)), strict=True))
 
     @property
-    def labels(self) -> tuple[str, ...]:
+    def labels(self) -> Sequence[str]:
         """A short name for each of ``tasks``: the first of its parts, such as the goal, and what else differs."""
         return self.evaluated_labels[: len(self.tasks)]
 
     @cached_property
-    def evaluated_labels(self) -> tuple[str, ...]:
+    def evaluated_labels(self) -> Sequence[str]:
         """`labels`, then those of the held-out tasks."""
         parts = [task.label_parts for task in (*self.tasks, *self.evaluation.held_out)]
         first = next(iter(parts[0]))
@@ -200,7 +226,7 @@ class Curriculum:
         return tuple(labels)
 
     @cached_property
-    def trained(self) -> tuple[tuple[int, ...], ...]:
+    def trained(self) -> Sequence[tuple[int, ...]]:
         """For each block, the positions of its tasks in ``tasks``."""
         position = {task: number for number, task in enumerate(self.tasks)}
         trained = []
@@ -224,7 +250,7 @@ class Curriculum:
             ValueError: names file and key: an unreadable or too large file, another fingerprint than stated, missing or
                 unknown keys, or values out of range.
         """
-        return read_curriculum(path_or_dict, cls)
+        return read_curriculum(path_or_dict, _of_blocks)
 
     @cached_property
     def fingerprint(self) -> str:
@@ -232,6 +258,116 @@ class Curriculum:
         content = {**_canonical(self), "name": "-", "source": "-"}
         text = json.dumps([FINGERPRINT_SCHEMA, content], sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+LAGS = (1, 10, 100)
+"""Blocks after which the tasks of a stream are evaluated again."""
+
+
+@dataclass(frozen=True, repr=False)
+class Stream(Curriculum):
+    """A curriculum whose tasks are drawn when they are needed, up to 100,000.
+
+    Block n trains task n or, where a task returns, the task of its first block. Evaluation is of the present task, and
+    at a block's end also of the next one and of those that were trained `LAGS` blocks before.
+
+    Args:
+        blocks: say how tasks are drawn.
+
+    Raises:
+        ValueError: as `Curriculum`, for held-out tasks, an evaluation of all tasks, and one that blocks do not repeat.
+    """
+
+    blocks: Life  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        make_fields_plain(self)
+        at_once = "a stream draws its tasks block by block, and all at once are asked for: take Stream.first(n)"
+        require((isinstance(self.blocks, Life), at_once))
+        how = self.evaluation
+        frames = self.blocks.num_frames
+        near = f"evaluation.every={how.every} must divide num_frames={frames} of a stream's blocks, or be 0"
+        seen = "a stream evaluates its present task and some before: evaluation.tasks must be seen, got all"
+        require(
+            (how.every == 0 or frames % how.every == 0, near),
+            (how.tasks == "seen", seen),
+            (not how.held_out, "a stream has no held_out tasks: evaluate further ones of another seed"),
+        )
+        self._check(True)
+
+    @cached_property
+    def tasks(self) -> DrawnTasks:
+        """The task of each block; one that returns counts by its first block."""
+        return self.blocks.tasks
+
+    @property
+    def examples(self) -> tuple[Task, ...]:
+        """The tasks from which all but the images is drawn."""
+        return self.blocks.choices
+
+    @property
+    def example_blocks(self) -> Sequence[Block]:
+        """The first block: all have its frames, and one task."""
+        return self.blocks[:1]
+
+    @cached_property
+    def ends(self) -> range:
+        """Frames of the run at each block's end."""
+        frames = self.blocks.num_frames
+        return range(frames, frames * len(self.blocks) + 1, frames)
+
+    @cached_property
+    def task_ids(self) -> dict[TaskLike, int]:
+        """The id of each of ``tasks``; makes them all."""
+        ids: dict[TaskLike, int] = {}
+        for task, number in zip(self.tasks, self.protocol.ids(len(self.tasks)), strict=True):
+            ids.setdefault(task, number)
+        return ids
+
+    @property
+    def labels(self) -> Lazy[str]:
+        """A short name for each of ``tasks``: its number and goal."""
+        return Lazy(len(self.blocks), self.blocks.label)
+
+    evaluated_labels = labels
+
+    @property
+    def trained(self) -> Lazy[tuple[int, ...]]:
+        """For each block, the position of its task in ``tasks``."""
+        return Lazy(len(self.blocks), self._trained)
+
+    def _trained(self, place: int) -> tuple[int]:
+        return (self.blocks.origin(place),)
+
+    def for_seed(self, seed: int) -> Stream:
+        """Return the stream that a run's seed draws, unless it has a seed of its own."""
+        return self if self.blocks.seed is not None else replace(self, blocks=replace(self.blocks, run_seed=seed))
+
+    def evaluated(self, frames: int) -> dict[TaskLike, tuple[int, str]]:
+        """Return the tasks to evaluate after ``frames`` frames, with their numbers, from 1, and labels."""
+        block = self.block_at(frames)
+        places = [max(block - 1, 0)]
+        if block and self.is_end(frames):
+            places += [place for place in (block, *(block - 1 - lag for lag in LAGS)) if 0 <= place < len(self.blocks)]
+        origins = dict.fromkeys(map(self.blocks.origin, places))
+        return {self.tasks[place]: (place + 1, self.labels[place]) for place in origins}
+
+    def first(self, count: int) -> Curriculum:
+        """Return the first blocks as a curriculum of their own, which JSON holds task by task.
+
+        Args:
+            count: of blocks, at least 1.
+        """
+        require((is_int(count, 1, len(self.blocks)), f"count must be in 1..{len(self.blocks)}, got {count!r}"))
+        name = f"{self.name}_first_{count}"
+        return Curriculum(name, self.version, self.source, self.blocks[:count], self.evaluation, protocol=self.protocol)
+
+
+def _of_blocks(
+    name: str, version: int, source: str, blocks: Any, evaluation: Evaluation, *, protocol: Protocol
+) -> Curriculum:
+    kind = Stream if isinstance(blocks, Life) else Curriculum
+    return kind(name, version, source, blocks, evaluation, protocol=protocol)
 
 
 def _some(names: Sequence[str], between: str = ", ") -> str:

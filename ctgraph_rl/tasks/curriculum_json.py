@@ -31,6 +31,7 @@ from ctgraph_rl.tasks.images import IMAGE_SETS
 from ctgraph_rl.tasks.kinds.frozen_arguments import DictArgument, TupleArgument, from_json
 from ctgraph_rl.tasks.kinds.gym_task import GymTask, require_wrapper_classes
 from ctgraph_rl.tasks.kinds.task_like import TaskLike, is_kind
+from ctgraph_rl.tasks.life import Life
 from ctgraph_rl.tasks.memory import bank_bytes
 from ctgraph_rl.tasks.observations import Observations
 from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
@@ -71,10 +72,10 @@ _CHOICES: dict[tuple[type, str], tuple[type, ...]] = {
 
 _PARTS: dict[tuple[type, str], type] = {(Task, "graph"): CTGraph, (Task, "observations"): Observations}
 
-_OF_TASKS = ((Block, "tasks"), (Evaluation, "held_out"))
+_OF_TASKS = ((Block, "tasks"), (Evaluation, "held_out"), (Life, "choices"))
 _OF_ARGUMENTS = ((GymTask, "kwargs"), (GymTask, "wrappers"))
 
-_NAMED_TYPES = (*chain.from_iterable(_CHOICES.values()), TupleArgument, DictArgument)
+_NAMED_TYPES = (*chain.from_iterable(_CHOICES.values()), TupleArgument, DictArgument, Life)
 
 _OURS = (*_NAMED_TYPES, *_PARTS.values(), Task, Block, Evaluation, Protocol)
 
@@ -86,7 +87,7 @@ TASK_KINDS: dict[str, type] = {GymTask.__name__: GymTask}
 def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = None) -> NamedValues:
     """Return a curriculum as JSON, and write it to ``path`` if given."""
     require((path is None or not lexists(path), f"{path} exists: choose another path, nothing is overwritten"))
-    tasks = (*curriculum.tasks, *curriculum.evaluation.held_out)
+    tasks = (*curriculum.examples, *curriculum.evaluation.held_out)
     places: dict[TaskLike, int] = {task: i for i, task in enumerate(tasks)}
     listed = []
     for task in places:
@@ -110,7 +111,7 @@ def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = 
     with within(curriculum.name):
         _check_form(content)
     about = []
-    for label, task in zip(curriculum.labels, curriculum.tasks, strict=True):
+    for label, task in zip(curriculum.labels, curriculum.examples, strict=False):
         facts: NamedValues = {"label": label}
         if isinstance(task, Task):
             facts["goal_leaf"] = task.goal_leaf
@@ -137,13 +138,18 @@ def read_curriculum(path_or_dict: str | PathLike[str] | ReadOnlyValues, make: Ca
         require((schema == SCHEMA, f"schema must be {SCHEMA}, got {schema!r}"))
         require((isinstance(content["source"], str), f"source must be a text, got {content['source']!r:.80}"))
         tasks = _each("tasks", content["tasks"], _task)
-        blocks = _each("blocks", content["blocks"], lambda block: _built(Block, block, tasks))
+        blocks: Any = content["blocks"]
+        if isinstance(blocks, Mapping):
+            with within("blocks"):
+                blocks = _chosen((Life,), blocks, tasks)
+        else:
+            blocks = tuple(_each("blocks", blocks, lambda block: _built(Block, block, tasks)))
         with within("evaluation"):
             evaluation = _built(Evaluation, content["evaluation"], tasks)
         with within("protocol"):
             protocol = _built(Protocol, content["protocol"])
         name = content["name"]
-        curriculum = make(name, content["version"], content["source"], tuple(blocks), evaluation, protocol=protocol)
+        curriculum = make(name, content["version"], content["source"], blocks, evaluation, protocol=protocol)
         stated = content["fingerprint"]
         found = curriculum.fingerprint
         fix = f"if the change is intended, write {found!r} there, and a new version and name"
@@ -278,13 +284,13 @@ def _field(place: tuple[type, str], content: Any, tasks: Sequence[TaskLike]) -> 
     return from_json(content) if place in _OF_ARGUMENTS else content
 
 
-def _chosen(kinds: Sequence[type], content: Any) -> Any:
+def _chosen(kinds: Sequence[type], content: Any, tasks: Sequence[TaskLike] = ()) -> Any:
     require((isinstance(content, Mapping), f"must be an object with a type, got {content!r:.80}"))
     names = by_name(*kinds)
     given = content.get("type")
     known = isinstance(given, str) and given in names
     require((known, f"type must be one of {', '.join(names)}, got {given!r:.80}"))
-    return _built(names[given], _without_type(content))
+    return _built(names[given], _without_type(content), tasks)
 
 
 def _without_type(content: ReadOnlyValues) -> NamedValues:

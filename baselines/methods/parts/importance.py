@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from typing_extensions import override
 
-from baselines.methods.method import Method, multi_task_blocks
+from baselines.methods.method import Method
 from baselines.methods.parts.heads import Heads
 from baselines.methods.parts.weights import Weights, flat
 from baselines.parts.learner import Learner
@@ -55,7 +55,7 @@ class Importance(Method):
         super().setup(agent, weights, curriculum)
         self.register_buffer("importance", weights.zeros())
         self.register_buffer("anchor", weights.zeros())
-        ids = curriculum.protocol.task_id != "hidden" and not multi_task_blocks(curriculum)
+        ids = curriculum.protocol.task_id != "hidden" and not curriculum.blocks_of_several
         if self.heads_setting == "multi" or (self.heads_setting == "auto" and ids):
             self.heads = Heads()
             self.heads.max_labels = self.max_labels

@@ -149,7 +149,7 @@ class SelectedMasks(MaskLC):
         self.generator = own_generator()
         self.curriculum = curriculum
         self.of_id = {number: task for task, number in curriculum.task_ids.items()}
-        self.num_actions = most_actions(curriculum.tasks)
+        self.num_actions = most_actions(curriculum.examples)
         for name in ("community", "places", "offsets"):
             self.register_buffer(name, torch.zeros(0, dtype=torch.float32, device="cpu"), persistent=False)
 

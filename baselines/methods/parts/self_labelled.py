@@ -18,7 +18,6 @@ from typing_extensions import override
 
 from baselines.detectors.judge import Judge
 from baselines.detectors.seen import SUSPICION, Seen
-from baselines.methods.method import multi_task_blocks
 from baselines.parts.networks import sequences_of, trunk_of
 from ctgraph_rl.agent import Agent, MethodLike
 from ctgraph_rl.checks import NamedValues, require
@@ -51,7 +50,7 @@ class SelfLabelled:
         detector = type(self.detector).__name__
         method = type(self.method).__name__
         hidden = not how.announces or self.detector.is_oracle
-        several = multi_task_blocks(curriculum)
+        several = curriculum.blocks_of_several
         reads = getattr(self.method, "reads_tasks", "")
         room = self.num_labels(curriculum)
         wants = len(curriculum.tasks) if self.detector.is_oracle else 0

@@ -1,0 +1,142 @@
+"""The curves of a stream's run, from its log."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ctgraph_rl.checks import NamedValues
+from ctgraph_rl.log.run_log import RunLog, tuning_share
+from ctgraph_rl.metrics.inputs import INPUTS
+from ctgraph_rl.metrics.record import Undefined, float64, ratio
+from ctgraph_rl.metrics.windows import LifeCurves
+from ctgraph_rl.tasks.curriculum import LAGS, Stream
+from ctgraph_rl.tasks.gain import optimal_gain
+from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.tasks.values import optimal_value
+
+NOT_OF_STREAMS = Undefined("a stream has too many tasks for a matrix: its metrics are those of windows")
+
+NOISY = Undefined(
+    "rewards have noise, so that means of episodes do not say what is adapted to: set evaluation.exact=true"
+)
+
+
+def life_inputs(log: RunLog, stream: Stream) -> NamedValues:
+    """Return the inputs of metrics that a stream's run gives, the others `Undefined`.
+
+    An unfinished run gives none, and a tuning run those of the whole blocks of its part.
+    """
+    done = finished_blocks(log, stream)
+    share = next(map(tuning_share, log.of_kind("run")), None)
+    needed = stream.frames_of(1 if share is None else share) // stream.blocks.num_frames
+    if done < needed or not done:
+        reason = Undefined(f"the run is not finished: it ended block {done:,} of {max(needed, 1):,}")
+        return dict.fromkeys(INPUTS, reason)
+    return {**dict.fromkeys(INPUTS, NOT_OF_STREAMS), **life_of_blocks(log, stream, needed)}
+
+
+def finished_blocks(log: RunLog, stream: Stream) -> int:
+    """Return how many blocks of a stream were evaluated at their end."""
+    reached = max((m["frames"] for m in log.of_kind("evaluation")), default=0)
+    return reached // stream.blocks.num_frames
+
+
+def life_of_blocks(log: RunLog, stream: Stream, count: int) -> NamedValues:
+    """Return the inputs of the first blocks of a life: its curves, and training by block in place of intervals."""
+    frames = stream.blocks.num_frames
+    drawn = [stream.blocks.choice(place) for place in range(count)]
+
+    def by_block(value: Callable[[Task], float]) -> Tensor:
+        return float64(list(map(value, stream.examples)))[drawn]
+
+    best = by_block(lambda task: optimal_value(task, 1.0))
+    zero = by_block(lambda task: task.fail_reward)
+    step_reward = by_block(lambda task: task.step_reward)
+    episodes, total, steps = _training(log, count)
+    first, *others = stream.examples
+    seen = _evaluations(log, stream, count)
+    curves = LifeCurves(
+        frames,
+        seen.moments,
+        seen.returns,
+        success=seen.success,
+        untrained=seen.untrained,
+        lagged=seen.lagged,
+        best=best,
+        zero=zero,
+        reward=total + step_reward * (frames - steps),
+        gain=by_block(optimal_gain),
+        alike=all(replace(task, goal=first.goal) == first for task in others),  # type: ignore[call-overload]
+    )
+    noisy = not stream.evaluation.exact and any(task.reward_std for task in stream.examples)
+    return {
+        "life": NOISY if noisy else curves,
+        "episodes": episodes,
+        "returns": ratio(total, episodes),
+        "interval_best": best,
+    }
+
+
+def _training(log: RunLog, count: int) -> Tensor:
+    """Return each block's finished episodes, the sums of their returns, and their steps, float64 [3, blocks].
+
+    Every step pays the step reward, and all else is paid as an episode ends. NaN for a block without a line.
+    """
+    sums = torch.full([3, count], torch.nan, dtype=torch.float64, device="cpu")
+    for m in log.of_kind("training"):
+        if m["block"] <= count:
+            played = m["episodes"]
+            sums_of_line = float64([played, played and played * m["return_mean"], played and played * m["length_mean"]])
+            sums[:, m["block"] - 1] = sums[:, m["block"] - 1].nan_to_num() + sums_of_line
+    return sums
+
+
+class _Seen(NamedTuple):
+    """As of `LifeCurves`."""
+
+    moments: Tensor
+    returns: Tensor
+    success: Tensor
+    untrained: Tensor
+    lagged: dict[int, Tensor]
+
+
+def _evaluations(log: RunLog, stream: Stream, count: int) -> _Seen:
+    frames = stream.blocks.num_frames
+    moments = range(0, frames + 1, stream.evaluation.every or frames)
+    nothing = torch.full([count], torch.nan, dtype=torch.float64, device="cpu")
+    returns = nothing.unsqueeze(1).repeat(1, len(moments))
+    success = nothing.clone()
+    untrained = nothing.clone()
+    lagged = {lag: nothing.clone() for lag in LAGS}
+    trained = [block[0] for block in stream.trained[: count + 1]]
+    for m in log.of_kind("evaluation"):
+        block = max(m["block"] - 1, 0)
+        if block >= count:
+            continue
+        task = m["task"] - 1
+        value = _number(m["return_mean"])
+        within = m["frames"] - block * frames
+        if task == trained[block]:
+            returns[block, moments.index(within)] = value
+        if within < frames:
+            continue
+        if task == trained[block]:
+            success[block] = _number(m["success_rate"])
+        if block + 1 < count and task == trained[block + 1]:
+            returns[block + 1, 0] = value
+            untrained[block + 1] = _number(m.get("untrained_return"))
+        for lag, values in lagged.items():
+            if block >= lag and task == trained[block - lag] and task not in trained[block - lag + 1 : block + 1]:
+                values[block] = value
+    return _Seen(float64(list(moments)), returns, success, untrained, lagged)
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value

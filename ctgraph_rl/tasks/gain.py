@@ -1,0 +1,87 @@
+"""Reward per frame: the largest of any policy, and what four simple policies lose in a block."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+
+from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.tasks.values import memoryless_ceiling, optimal_value, policy_measures
+
+BISECTIONS = 80
+"""Halvings of the interval in which the largest gain lies; float64 has 53 bits."""
+
+
+def optimal_gain(task: Task) -> float:
+    """Return g*, the largest E[return] / E[length] of any policy.
+
+    The best value of episodes that pay g for every step is 0 at g = g*, and falls with g (Dinkelbach 1967).
+
+    Example:
+        >>> from ctgraph_rl.tasks.configurations import ct_fo_b1
+        >>> round(optimal_gain(ct_fo_b1()) * ct_fo_b1().graph.expected_episode_length, 12)
+        1.0
+    """
+    low, high = -1.0, 1.0
+    while _surplus(task, low) < 0:
+        low *= 2
+    while _surplus(task, high) > 0:
+        high *= 2
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        if _surplus(task, middle) > 0:
+            low = middle
+        else:
+            high = middle
+    return (low + high) / 2
+
+
+def _surplus(task: Task, gain: float) -> float:
+    return optimal_value(replace(task, step_reward=task.step_reward - gain), 1.0)
+
+
+class Lost(NamedTuple):
+    """What a policy loses in a block, on average."""
+
+    in_episodes: float  # of return, in finished episodes
+    in_frames: float  # of reward, in all frames
+
+
+def lost_by_policies(task: Task, num_frames: int) -> dict[str, Lost]:
+    """Return what the optimal policy, a search, the best memoryless and the random policy lose in a block.
+
+    The search tries each end state once by the best way, and then returns to the goal; it starts anew in each block.
+
+    Args:
+        num_frames: of the block. The part of an episode at its end counts as its share.
+
+    Returns:
+        By name; without search and memoryless, where these have no closed form.
+    """
+    b = task.graph.branching_factor
+    uniform = torch.full([task.images.num_images, b + 1], 1 / (b + 1), dtype=torch.float64, device="cpu")
+    chance = policy_measures(task, uniform)
+    best = optimal_value(task, 1.0)
+    gain = optimal_gain(task)
+
+    def lost(value: float, length: float) -> Lost:
+        return Lost(num_frames / length * (best - value), num_frames * (gain - value / length))
+
+    found = {"optimal": Lost(0.0, 0.0), "random": lost(chance.return_mean, chance.length_mean)}
+    try:
+        ceiling = memoryless_ceiling(task)
+    except ValueError:  # not a needle, so the other two have no closed form
+        return found
+    length = task.graph.expected_episode_length + task.extra_end_step
+    failures = _failed_searches(task.graph.num_end_states, num_frames / length)
+    found["memoryless"] = lost(ceiling, length)
+    found["search"] = Lost(failures * task.goal_reward, failures * task.goal_reward)
+    return found
+
+
+def _failed_searches(num_goals: int, num_episodes: float) -> float:
+    """Return the mean number of episodes that end elsewhere: episode i does with probability 1 - i / n."""
+    tried = min(num_episodes, num_goals)
+    return tried - tried * (tried + 1) / (2 * num_goals)

@@ -1,0 +1,252 @@
+"""The blocks of a stream: a task each, drawn by seed when it is needed."""
+
+from __future__ import annotations
+
+import random
+from array import array
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, TypeVar, overload
+
+from ctgraph_rl.checks import are_ints, is_int, is_real, make_fields_plain, one_of, require
+from ctgraph_rl.core.goal import write_goal
+from ctgraph_rl.tasks.protocol import Block
+from ctgraph_rl.tasks.task import Task
+
+Item = TypeVar("Item")
+
+ORDERS = ("similar", "dissimilar", "returning", "drifting")
+
+MOST_STREAMED = 100_000
+"""Most tasks of a stream."""
+
+IMAGE_SEEDS = 2**40
+"""New image sets have a seed below this."""
+
+KEPT = 256
+"""Tasks that are kept after they were made."""
+
+
+class Lazy(Sequence[Item]):
+    """Items that are made when asked for; slices are tuples."""
+
+    def __init__(self, count: int, make: Callable[[int], Item]) -> None:
+        self._count = count
+        self._make = make
+
+    def __len__(self) -> int:
+        return self._count
+
+    @overload
+    def __getitem__(self, place: int) -> Item: ...
+    @overload
+    def __getitem__(self, place: slice) -> tuple[Item, ...]: ...
+    def __getitem__(self, place: int | slice) -> Item | tuple[Item, ...]:
+        if isinstance(place, slice):
+            return tuple(self[i] for i in range(*place.indices(len(self))))
+        if not -len(self) <= place < len(self):
+            raise IndexError(place)
+        return self._make(place % len(self))
+
+
+class DrawnTasks(Lazy[Task]):
+    """The tasks of a stream; the last `KEPT` that were asked for are kept.
+
+    Args:
+        examples: tasks that have every graph, reward and kind of image.
+    """
+
+    def __init__(self, count: int, make: Callable[[int], Task], examples: tuple[Task, ...]) -> None:
+        super().__init__(count, self._kept)
+        self.examples = examples
+        self._draw = make
+        self._made: dict[int, Task] = {}
+
+    def _kept(self, place: int) -> Task:
+        task = self._made.pop(place, None) or self._draw(place)
+        self._made[place] = task
+        if len(self._made) > KEPT:
+            del self._made[next(iter(self._made))]
+        return task
+
+    def index(self, value: Any, start: int = 0, stop: int | None = None) -> int:
+        """Return the number of a task, one that is kept first."""
+        for place, task in reversed(self._made.items()):
+            if task == value:
+                return place
+        return super().index(value, start, len(self) if stop is None else stop)
+
+
+@dataclass(frozen=True)
+class Life(Sequence[Block]):
+    """Blocks of one task each. The first n do not depend on how many follow.
+
+    Orders: ``similar`` tasks share one image set, and neighbours differ otherwise; of ``dissimilar`` ones each has
+    another image set; ``returning``: as dissimilar, but ``share`` of the blocks have the task of ``lag`` blocks before;
+    ``drifting``: a task has another image set than the one before, or one other decision on the way to its goal.
+
+    Args:
+        choices: the tasks from which all but the image set is drawn.
+        num_tasks: blocks, at most `MOST_STREAMED`.
+        num_frames: of each block.
+        order: one of `ORDERS`.
+        image_seeds: the image sets to draw from; none: a new set each time.
+        share: of ``returning`` blocks, in (0, 1].
+        lag: blocks between a task and its return.
+        seed: of the draws, in [0, 2**63); None: ``run_seed``.
+        run_seed: of the run; no part of the curriculum's fingerprint.
+
+    Raises:
+        ValueError: for values out of range, and an order that the choices do not allow.
+    """
+
+    choices: tuple[Task, ...]
+    num_tasks: int
+    num_frames: int
+    order: str = "dissimilar"
+    image_seeds: tuple[int, ...] = ()
+    share: float = 0.5
+    lag: int = 10
+    seed: int | None = None
+    run_seed: int = field(default=0, compare=False)
+
+    def __post_init__(self) -> None:
+        make_fields_plain(self)
+        is_share = is_real(self.share, 0, 1) and self.share > 0
+        is_seed = self.seed is None or is_int(self.seed, 0, 2**63 - 1)
+        are_choices = bool(self.choices) and all(isinstance(task, Task) for task in self.choices)
+        images = self.image_seeds
+        are_sets = are_ints(images, 0, 2**63 - 1) and len(set(images)) == len(images)
+        require(
+            (are_choices, f"a stream draws from at least one Task, got {self.choices!r:.80}"),
+            (
+                is_int(self.num_tasks, 1, MOST_STREAMED),
+                f"num_tasks must be in 1..{MOST_STREAMED:,}, got {self.num_tasks!r}",
+            ),
+            (is_int(self.num_frames, 1), f"num_frames must be an integer >= 1, got {self.num_frames!r}"),
+            *one_of(ORDERS, order=self.order),
+            (are_sets, f"image_seeds must be different integers in [0, 2**63), got {images!r:.80}"),
+            (is_share, f"share must be in (0, 1], got {self.share!r}"),
+            (is_int(self.lag, 1), f"lag must be an integer >= 1, got {self.lag!r}"),
+            (is_seed, f"seed must be an integer in [0, 2**63) or null, got {self.seed!r}"),
+            (is_int(self.run_seed, 0, 2**63 - 1), f"run_seed must be in [0, 2**63), got {self.run_seed!r}"),
+        )
+        many_images = len(images) != 1 and all(task.image_seed is not None for task in self.choices)
+        several = len(self.choices) > 1
+        returns = f"lag={self.lag} must be less than num_tasks={self.num_tasks}, else no task returns"
+        drifts = not several or all(self._neighbours.values())
+        alone = "needs goals that differ in one decision: give goals=all, or one goal"
+        require(
+            (self.order == "similar" or many_images, f"order={self.order} needs several generated image sets"),
+            (self.order != "similar" or several, "order=similar needs tasks that differ in more than their images"),
+            (self.order != "returning" or self.lag < self.num_tasks, returns),
+            (self.order != "drifting" or drifts, f"order=drifting {alone}"),
+        )
+
+    @cached_property
+    def _neighbours(self) -> dict[int, list[int]]:
+        """For each choice, those that differ from it in one decision alone."""
+        places = {task: place for place, task in enumerate(self.choices)}
+        found: dict[int, list[int]] = {}
+        for task, place in places.items():
+            found[place] = []
+            for level, own in enumerate(task.goal):
+                for branch in range(1, task.graph.branching_factor + 1):
+                    goal = (*task.goal[:level], branch, *task.goal[level + 1 :])
+                    other = places.get(replace(task, goal=goal))
+                    if branch != own and other is not None:
+                        found[place].append(other)
+        return found
+
+    @cached_property
+    def _draws(self) -> _Draws:
+        return _Draws(self, self._neighbours if self.order == "drifting" else {})
+
+    @cached_property
+    def tasks(self) -> DrawnTasks:
+        """The task of each block."""
+        return DrawnTasks(self.num_tasks, self._draw_task, self.choices)
+
+    def _draw_task(self, place: int) -> Task:
+        choice, image_seed, _ = self._draws.at(place)
+        task = self.choices[choice]
+        if task.image_seed is None:
+            return task
+        return replace(task, images=replace(task.images, seed=image_seed))  # type: ignore[type-var]
+
+    def origin(self, place: int) -> int:
+        """Return the first block, from 0, that has the task of a block."""
+        return self._draws.at(place)[2]
+
+    def choice(self, place: int) -> int:
+        """Return the position in ``choices`` of what a block's task is drawn from."""
+        return self._draws.at(place)[0]
+
+    def label(self, place: int) -> str:
+        """Return a short name of a block's task: its number, from 1, and its goal."""
+        return f"{place + 1}:goal{write_goal(self.choices[self.choice(place)].goal)}"
+
+    def __len__(self) -> int:
+        return self.num_tasks
+
+    def __getitem__(self, place: Any) -> Any:
+        tasks = self.tasks[place]
+        if isinstance(place, slice):
+            return tuple(Block((task,), self.num_frames) for task in tasks)
+        return Block((tasks,), self.num_frames)
+
+
+class _Draws:
+    """The draws up to the last block that was asked for, 16 bytes each."""
+
+    def __init__(self, life: Life, neighbours: dict[int, list[int]]) -> None:
+        self.life = life
+        self.neighbours = neighbours
+        self._source = random.Random(life.run_seed if life.seed is None else life.seed)
+        self._choices = array("I")
+        self._images = array("Q")
+        self._origins = array("I")
+
+    def at(self, place: int) -> tuple[int, int, int]:
+        """Return a block's choice, image seed and first block with its task."""
+        while len(self._origins) <= place:
+            self._draw()
+        return self._choices[place], self._images[place], self._origins[place]
+
+    def _below(self, count: int) -> int:
+        return int(self._source.random() * count)
+
+    def _draw(self) -> None:
+        life = self.life
+        place = len(self._origins)
+        if life.order == "returning" and place >= life.lag and self._source.random() < life.share:
+            before = place - life.lag
+            self._add(self._choices[before], self._images[before], self._origins[before])
+        elif place == 0:
+            self._add(self._below(len(life.choices)), self._new_image(), 0)
+        elif life.order == "similar":
+            other = (self._choices[-1] + 1 + self._below(len(life.choices) - 1)) % len(life.choices)
+            self._add(other, self._images[-1], place)
+        elif life.order == "drifting":
+            others = self.neighbours[self._choices[-1]]
+            depth = len(life.choices[self._choices[-1]].goal)
+            if others and self._below(depth + 1):
+                self._add(others[self._below(len(others))], self._images[-1], place)
+            else:
+                self._add(self._choices[-1], self._new_image(), place)
+        else:
+            self._add(self._below(len(life.choices)), self._new_image(), place)
+
+    def _new_image(self) -> int:
+        """Draw an image set other than the last."""
+        known = self.life.image_seeds
+        if not known:
+            return self._below(IMAGE_SEEDS)
+        last = known.index(self._images[-1]) if self._images else self._below(len(known))
+        return known[(last + 1 + self._below(max(len(known) - 1, 1))) % len(known)]
+
+    def _add(self, choice: int, image: int, origin: int) -> None:
+        self._choices.append(choice)
+        self._images.append(image)
+        self._origins.append(origin)
