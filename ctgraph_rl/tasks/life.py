@@ -14,7 +14,7 @@ from ctgraph_rl.core.goal import write_goal
 from ctgraph_rl.tasks.protocol import Block
 from ctgraph_rl.tasks.task import Task
 
-Item = TypeVar("Item")
+Made = TypeVar("Made")
 
 ORDERS = ("similar", "dissimilar", "returning", "drifting")
 
@@ -28,10 +28,10 @@ KEPT = 256
 """Tasks that are kept after they were made."""
 
 
-class Lazy(Sequence[Item]):
+class Lazy(Sequence[Made]):
     """Items that are made when asked for; slices are tuples."""
 
-    def __init__(self, count: int, make: Callable[[int], Item]) -> None:
+    def __init__(self, count: int, make: Callable[[int], Made]) -> None:
         self._count = count
         self._make = make
 
@@ -39,10 +39,10 @@ class Lazy(Sequence[Item]):
         return self._count
 
     @overload
-    def __getitem__(self, place: int) -> Item: ...
+    def __getitem__(self, place: int) -> Made: ...
     @overload
-    def __getitem__(self, place: slice) -> tuple[Item, ...]: ...
-    def __getitem__(self, place: int | slice) -> Item | tuple[Item, ...]:
+    def __getitem__(self, place: slice) -> tuple[Made, ...]: ...
+    def __getitem__(self, place: int | slice) -> Made | tuple[Made, ...]:
         if isinstance(place, slice):
             return tuple(self[i] for i in range(*place.indices(len(self))))
         if not -len(self) <= place < len(self):

@@ -1,0 +1,137 @@
+"""The loop over a stream: what rows see, what is evaluated and logged, regret, and resuming."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers.scripted import Scripted
+from helpers.stopped_runs import logs_of_equal_ends, make_agent
+
+import curricula
+from ctgraph_rl import RunLog, learn_curriculum
+from ctgraph_rl.learn.stacked import why_not_together
+from ctgraph_rl.log.scores import scores
+from ctgraph_rl.runs.train import new_agent
+from ctgraph_rl.tasks.gain import optimal_gain
+
+SAMPLED = {"exact": False, "num_episodes": 4}
+
+
+def stream(evaluation=None, protocol=None, **changes):
+    life = curricula.load("stream", **{"num_tasks": 5, "num_frames": 64, "seed": 2, **changes})
+    return replace(
+        life,
+        evaluation=replace(life.evaluation, **(evaluation or {})),
+        protocol=replace(life.protocol, **(protocol or {})),
+    )
+
+
+def at_random(data):
+    return data.set("action", torch.randint(0, 3, data.batch_size))
+
+
+def learner(life):
+    return new_agent(life, make_agent, 3)
+
+
+@pytest.mark.parametrize("boundaries", ["announced", "hidden"])
+def test_rows_see_the_images_of_their_blocks_task(boundaries):
+    life = stream(SAMPLED, {"boundaries": boundaries}, wait_prob=0.5)
+    agent = Scripted(at_random, num_envs=4, num_steps=16)
+
+    learn_curriculum(life, agent)
+
+    for number, batch in enumerate(agent.batches):
+        own = life.tasks[number].images.images
+        before = life.tasks[max(number - 1, 0)].images.images
+        for row in range(4):
+            of_task = [bool((image == own).all(-1).all(-1).any()) for image in batch["observation"][row]]
+            changed = of_task.index(True)
+            assert all(of_task[changed:])
+            assert boundaries == "hidden" or changed == 0
+            assert all((image == before).all(-1).all(-1).any() for image in batch["observation"][row][:changed])
+
+
+@pytest.mark.parametrize("rewards", [{}, {"step_reward": -0.25, "fail_reward": -2.0}])
+def test_regret_in_frames_is_of_every_reward_and_in_episodes_of_finished_ones(rewards):
+    life = stream(SAMPLED, **rewards)
+    agent = Scripted(at_random, num_envs=4, num_steps=16)
+
+    found = scores(learn_curriculum(life, agent), life)
+
+    paid = sum(batch["next", "reward"].double().sum().item() for batch in agent.batches)
+    ends = torch.cat([batch["next"][batch["next", "done"].squeeze(-1)]["episode_reward"] for batch in agent.batches])
+    assert found["frame_regret"].value == pytest.approx(5 * 64 * optimal_gain(life.tasks[0]) - paid, abs=1e-5)
+    best = life.tasks[0].optimal_value(1.0)
+    assert found["regret"].value == pytest.approx((best - ends.double()).sum().item(), abs=1e-5)
+
+
+def test_a_block_has_its_tasks_evaluations_and_at_its_end_those_of_others():
+    life = stream()
+
+    log = learn_curriculum(life, learner(life))
+
+    by_frames: dict[int, list[int]] = {}
+    for m in log.of_kind("evaluation"):
+        by_frames.setdefault(m["frames"], []).append(m["task"])
+    within = {frames: [1 + frames // 64] for frames in range(8, 320, 8) if frames % 64}
+    assert by_frames == {0: [1], **within, 64: [1, 2], 128: [2, 3, 1], 192: [3, 4, 2], 256: [4, 5, 3], 320: [5, 4]}
+    untrained = [m["task"] for m in log.of_kind("evaluation") if "untrained_return" in m]
+    assert untrained == [2, 3, 4, 5]
+    assert "trained" not in log.measurements[0]
+
+
+def test_an_agent_that_does_not_learn_has_no_jump_start_and_equal_returns():
+    life = stream({"greedy": False})
+    agent = learner(life)
+    agent.learn = lambda batch: {}
+
+    log = learn_curriculum(life, agent)
+    found = scores(log, life)
+
+    assert found["jump_start"].value == 0.0
+    assert found["never_adapted"].value == 1.0
+    assert found["retention_1"].value == pytest.approx(1.0)
+    assert found["average_performance"].undefined == (
+        "a stream has too many tasks for a matrix: its metrics are those of windows"
+    )
+
+
+@pytest.mark.parametrize("boundaries", ["announced", "hidden"])
+def test_a_resumed_life_ends_with_the_same_weights(boundaries, tmp_path):
+    life = stream({"every": 0}, {"boundaries": boundaries}, num_frames=80)
+
+    logs = logs_of_equal_ends(life, lambda: learner(life), tmp_path)
+
+    without = [[json.dumps({**m, "seconds": 0}) for m in log.measurements] for log in logs]
+    assert without[1] == without[0]
+    assert without[2] == without[0]
+
+
+def test_an_unfinished_life_and_noisy_episodes_have_no_windows():
+    life = stream({**SAMPLED, "every": 0}, reward_std=1.0)
+    log = learn_curriculum(life, Scripted(at_random, num_steps=16))
+    cut = RunLog()
+    cut.measurements = [m for m in log.measurements if m["frames"] < 200]
+
+    assert "set evaluation.exact=true" in scores(log, life)["window_return"].undefined
+    assert scores(cut, life)["window_return"].undefined == "the run is not finished: it ended block 3 of 5"
+
+
+def test_seeds_with_lives_of_their_own_are_not_trained_as_one_batch():
+    assert why_not_together(stream()) is None
+    assert "give curriculum.seed=0" in why_not_together(stream(seed=None))
+
+
+def test_ids_of_a_stream_are_those_of_first_blocks():
+    life = stream(order="returning", share=1.0, lag=2, protocol={"task_id": "one_hot"})
+    agent = Scripted(at_random, num_envs=4, num_steps=16)
+    agent.policy_for = lambda task: agent.policy
+
+    learn_curriculum(replace(life, evaluation=replace(life.evaluation, **SAMPLED)), agent)
+
+    shown = [batch["task_id"].long().argmax(-1).unique().tolist() for batch in agent.batches]
+    assert shown == [[0], [1], [0], [1], [0]]

@@ -1,0 +1,72 @@
+"""Reward per frame, and what simple policies lose."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from ctgraph_rl import evaluate
+from ctgraph_rl.core.rewards import Gradient
+from ctgraph_rl.policies import RandomPolicy, SearchPolicy
+from ctgraph_rl.tasks.configurations import ct_fo_b1, ct_su_b1
+from ctgraph_rl.tasks.gain import lost_by_policies, optimal_gain
+
+
+@pytest.mark.parametrize("wait_prob", [0.0, 0.5])
+@pytest.mark.parametrize("depth", [1, 3])
+def test_a_needles_largest_gain_is_its_reward_over_the_shortest_episode(depth, wait_prob):
+    task = ct_su_b1(goal="1.1")
+    task = replace(
+        task, graph=replace(task.graph, depth=depth, wait_prob=wait_prob), goal=(1,) * depth, goal_reward=3.0
+    )
+
+    assert optimal_gain(task) == pytest.approx(3 / task.graph.expected_episode_length, abs=1e-12)
+
+
+def test_where_failing_at_once_pays_most_per_frame_the_largest_gain_is_that_of_failing():
+    task = replace(ct_fo_b1(), fail_reward=0.6)  # 0.6 in 2 steps, against 1 in 6
+
+    assert task.optimal_value(1.0) == 1.0
+    assert optimal_gain(task) == pytest.approx(0.3, abs=1e-12)
+
+
+def test_a_reward_of_every_step_adds_to_the_largest_gain():
+    assert optimal_gain(replace(ct_fo_b1(), step_reward=-0.5)) == pytest.approx(1 / 6 - 0.5, abs=1e-12)
+
+
+def test_what_policies_lose_in_a_block_by_hand():
+    lost = lost_by_policies(ct_fo_b1(), num_frames=6 * 10)  # four goals, ten optimal episodes
+
+    assert lost["optimal"] == (0.0, 0.0)
+    assert lost["memoryless"] == pytest.approx((0.0, 0.0), abs=1e-9)  # all is observed
+    assert lost["search"] == pytest.approx((1.5, 1.5))  # 3/4 + 2/4 + 1/4
+    assert lost_by_policies(ct_fo_b1(), num_frames=12)["search"] == pytest.approx((1.25, 1.25))
+
+
+def test_the_random_policy_loses_what_it_is_measured_to_lose():
+    task = ct_fo_b1()
+    played = evaluate(RandomPolicy, [task], 20_000, seed=3)
+    value = played["episode_reward"].double().mean().item()
+    length = played["step_count"].double().mean().item()
+
+    in_episodes, in_frames = lost_by_policies(task, 1000)["random"]
+
+    assert in_episodes == pytest.approx(1000 / length * (1 - value), rel=0.02)  # standard error 0.4%
+    assert in_frames == pytest.approx(1000 * (1 / 6 - value / length), rel=0.02)
+
+
+def test_a_search_fails_as_often_as_it_is_measured_to():
+    task = ct_fo_b1()
+    played = evaluate(SearchPolicy, [task], 5000, seed=3, episodes_per_row=5)
+
+    failures = 5 - 5 * played["episode_reward"].double().mean().item()
+
+    assert lost_by_policies(task, 5 * 6)["search"].in_episodes == 1.5
+    assert failures == pytest.approx(1.5, abs=0.15)  # standard error 0.035
+
+
+def test_rewards_without_closed_forms_have_no_lines_of_search_and_memoryless_policies():
+    lost = lost_by_policies(replace(ct_fo_b1(), reward_fn=Gradient()), 100)
+
+    assert {*lost} == {"optimal", "random"}
