@@ -34,8 +34,8 @@ def life_inputs(log: RunLog, stream: Stream) -> NamedValues:
     """
     done = finished_blocks(log, stream)
     share = next(map(tuning_share, log.of_kind("run")), None)
-    needed = stream.frames_of(1 if share is None else share) // stream.blocks.num_frames
-    if done < needed or not done:
+    needed = len(stream.blocks) if share is None else min(done, stream.frames_of(share) // stream.blocks.num_frames)
+    if done < needed or not needed:
         reason = Undefined(f"the run is not finished: it ended block {done:,} of {max(needed, 1):,}")
         return dict.fromkeys(INPUTS, reason)
     return {**dict.fromkeys(INPUTS, NOT_OF_STREAMS), **life_of_blocks(log, stream, needed)}
