@@ -39,7 +39,7 @@ def stream(
     reward_std: float = 0.0,
     reward_fn: str | Sequence[str] = "needle",
 ) -> Curriculum:
-    """A life of many tasks, each drawn by seed when it is needed: does learning go on?
+    """A life of many tasks, each drawn by seed when it is needed: does a learner keep learning?
 
     A task is drawn uniformly from all combinations of the lists, and of their goals. Each block has eight evaluations,
     if ``num_frames`` is a multiple of eight.
@@ -51,7 +51,7 @@ def stream(
             share comes again; ``drifting``, one decision or the image set changes at a time.
         share: of blocks with a task that returns, in (0, 1].
         lag: blocks between a task and its return.
-        seed: draws the tasks; None: the run's seed, so that each seed has a life of its own.
+        seed: draws the tasks; None: the run's seed, so that seeds have different lives.
         configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1, or several.
         branching_factor: another b; None: as configured.
         depth: another d, or several, with the ids of the deepest graph; None: as configured.

@@ -340,7 +340,7 @@ class Stream(Curriculum):
         return (self.blocks.origin(place),)
 
     def for_seed(self, seed: int) -> Stream:
-        """Return the stream that a run's seed draws, unless it has a seed of its own."""
+        """Return the stream that a run's seed draws; unchanged if it has its seed."""
         return self if self.blocks.seed is not None else replace(self, blocks=replace(self.blocks, run_seed=seed))
 
     def evaluated(self, frames: int) -> dict[TaskLike, tuple[int, str]]:
@@ -353,7 +353,7 @@ class Stream(Curriculum):
         return {self.tasks[place]: (place + 1, self.labels[place]) for place in origins}
 
     def first(self, count: int) -> Curriculum:
-        """Return the first blocks as a curriculum of their own, which JSON holds task by task.
+        """Return the first blocks as a plain curriculum, which JSON holds task by task.
 
         Args:
             count: of blocks, at least 1.

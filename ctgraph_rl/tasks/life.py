@@ -136,17 +136,17 @@ class Life(Sequence[Block]):
         several = len(self.choices) > 1
         returns = f"lag={self.lag} must be less than num_tasks={self.num_tasks}, else no task returns"
         drifts = not several or all(self._neighbours.values())
-        alone = "needs goals that differ in one decision: give goals=all, or one goal"
+        fix = "needs goals that differ in one decision: give goals=all, or one goal"
         require(
             (self.order == "similar" or many_images, f"order={self.order} needs several generated image sets"),
             (self.order != "similar" or several, "order=similar needs tasks that differ in more than their images"),
             (self.order != "returning" or self.lag < self.num_tasks, returns),
-            (self.order != "drifting" or drifts, f"order=drifting {alone}"),
+            (self.order != "drifting" or drifts, f"order=drifting {fix}"),
         )
 
     @cached_property
     def _neighbours(self) -> dict[int, list[int]]:
-        """For each choice, those that differ from it in one decision alone."""
+        """For each choice, those that differ from it in one decision only."""
         places = {task: place for place, task in enumerate(self.choices)}
         found: dict[int, list[int]] = {}
         for task, place in places.items():
