@@ -52,7 +52,7 @@ class Lost(NamedTuple):
 def lost_by_policies(task: Task, num_frames: int) -> dict[str, Lost]:
     """Return what the optimal policy, a search, the best memoryless and the random policy lose in a block.
 
-    The search tries each end state once by the best way, and then returns to the goal; it starts anew in each block.
+    The search tries each end state once by the best way, and then returns to the goal; each block starts a new one.
 
     Args:
         num_frames: of the block. The part of an episode at its end counts as its share.
