@@ -47,8 +47,8 @@ def _(t):
 
 @reads("masks_ct8_md")
 def _(t):
-    """Fine-tuned PPO solves `1.1.1.1.1` in eight and `1.1.1.1.2` in two of 20 seeds, because the goals are nested:
-    after `1.1.1` it solves `1.1`, `1.1.1`, `1.1.1.1` and `1.1.1.1.1` in every seed."""
+    """Fine-tuned PPO solves `1.1.1.1.1` in eight and `1.1.1.1.2` in two of 20 seeds, because the goals are
+    nested."""
     own = t.own("finetune")
     both = own[:, 6:].all(1).sum() == 2  # as README says
     nested = t.ends("finetune")[:, 2, [0, 2, 4, 6]].all()
@@ -57,7 +57,7 @@ def _(t):
 
 @reads("masks_ct8_md")
 def _(t):
-    """It then forgets: fifteen seeds end with no task solved."""
+    """Fifteen seeds end with no task solved."""
     return (~t.known("finetune").any(1)).sum() == 15
 
 

@@ -248,13 +248,12 @@ def test_cells_of_all_tables_were_run_again_and_only_those_of_the_earlier_revisi
     ):
         in_part = [int(line["numbers"]) // tasks - 1 for line in again if line["table"] == table]  # evaluations of 20
         assert (len(in_part), min(in_part), max(in_part)) == (count, least * 20, most * 20)
-    assert "ten seeds of two or three methods each in groups as before" in HOW_MADE
-    assert "a run's first block, or, of these groups, the first 30 to 100 % of it" in HOW_MADE
+    assert "of masks, those of the first 30 % or more of a block were compared" in HOW_MADE
     other_greedy = [(line["depth"], line["seed"]) for line in changed if line["equal"] not in "24"]
     assert other_greedy == [("4", "2")]
     assert [line["equal"] for line in changed if (line["depth"], line["seed"]) == ("5", "1")] == ["2"], "the greedy two"
-    assert len(changed) == 20 and "20 of 20 were run again" in HOW_MADE
-    assert "seed 2 of depth 4 had not learned and now has, and seed 1 of depth 5 is now right by chance" in HOW_MADE
+    assert len(changed) == 20 and "The 20 cells of `ppo_published` on the depth ladder were replaced" in HOW_MADE
+    assert "two greedy numbers changed, those of seed 2 of depth 4 and seed 1 of depth 5" in HOW_MADE
 
 
 def of_seeds_together(of):

@@ -62,7 +62,7 @@ def test_simulated_cells_are_computed_again(coverage, rule, shape, n):
     ("kind", "noise", "n"),
     [
         ("equal, mean 1", 0.01, 3),
-        *(pytest.param("equal, mean 0.98", noise, 5, marks=pytest.mark.slow) for noise in (0.1, 2.0)),
+        *(pytest.param("equal, mean 1", noise, 5, marks=pytest.mark.slow) for noise in (0.1, 0.5)),
         *(pytest.param("solve at 0.5", 0.01, n, marks=pytest.mark.slow) for n in (20, 50)),
         pytest.param("solve at 0.98", 0.5, 50, marks=pytest.mark.slow),
     ],
@@ -76,7 +76,7 @@ def test_intervals_cover_noisy_returns_from_five_seeds_on(coverage):
         covered(cell) for kind in coverage.KINDS for noise in coverage.NOISES for cell in cells(kind, f"{noise:g}")
     ]
 
-    assert len(shares) == 6 * 4 * 5 and (min(coverage.NOISES), max(coverage.NOISES)) == (0.01, 2)
+    assert len(shares) == 4 * 3 * 5 and (min(coverage.NOISES), max(coverage.NOISES)) == (0.01, 0.5)
     assert min(shares) >= 94
 
 
@@ -87,8 +87,8 @@ def test_bounds_of_a_mean_do_not_cover_noisy_returns_where_it_is_at_one(coverage
     assert coverage.are_covered(samples, centre, Bounds(0.0, 1.0).widened(0.01)).all()
 
 
-@pytest.mark.parametrize("noise", [0.01, 2.0])
-@pytest.mark.parametrize("kind", ["equal, mean 0.5", "equal, mean 1", "solve at 0.9"])
+@pytest.mark.parametrize("noise", [0.01, 0.5])
+@pytest.mark.parametrize("kind", ["equal, mean 1", "solve at 0.5", "solve at 0.9"])
 def test_what_is_counted_is_whether_the_intervals_of_the_package_hold_the_mean(coverage, kind, noise):
     samples, _ = coverage.noisy_returns(kind, noise, n=5, draws=12)
     samples[0, 0] = 20.0  # outside of all bounds, so that Student's interval counts

@@ -148,20 +148,6 @@ def against(found: Runs, first: tuple[str, ...], second: tuple[str, ...]) -> Com
     return statistics.compare(values, others, bounds=SUCCESS)
 
 
-def gate_differences() -> str:
-    """Return a row for each agent and gate: its success after adaptation less that without a gate, by seed."""
-    rows = []
-    of = runs(2)
-    for agent, gate in of:
-        if gate != "none":
-            found = against(of, (agent, gate), (agent, "none"))
-            record = f"{found.wins}, {found.ties}, {found.losses}"
-            rows.append(
-                [LABELS[agent], f"`{gate}`", shown(found.difference), record, str(seeds_that_would_do(found) or "-")]
-            )
-    return table(["agent", "gate", "difference", "better, equal, worse", "seeds that would do"], rows)
-
-
 RIVALS = ("cavia", "rl2", "maml")
 """Agents below PEARL."""
 
@@ -226,7 +212,6 @@ def page() -> str:
     text = (TEMPLATES / "adaptation.md").read_text(encoding="utf-8")
     return Template(text).substitute(
         successes(2) | successes(2, SURJECTIVE) | differences(),
-        gate_differences=gate_differences(),
         gates=gates_table(2),
         without_memory=f"{WITHOUT_MEMORY:.3f}",
         depth_2=adaptation_table(2),

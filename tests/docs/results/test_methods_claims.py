@@ -64,7 +64,7 @@ def _(t):
 
 @reads("methods")
 def _(t):
-    """With MAS, PackNet and SI, PPO keeps all that it learned, but finds depth 5 in five, three and two seeds, fewer
+    """With MAS, PackNet and SI, PPO keeps all that it learned. It finds depth 5 in five, three and two seeds, fewer
     than fine-tuned PPO (p < 0.05, corrected for six methods)."""
     return t.keeps_and_finds(("mas", "packnet", "si")) == (True, [5, 3, 2]) and max(fewer(t)[3:]) < 0.05
 
@@ -102,8 +102,8 @@ def _(t):
 
 @reads("methods")
 def _(t):
-    """With the other three agents each method is better than fine-tuning between goals, each but EWC and CLEAR between
-    image sets, and none with growing depth (15 pairs, taken as independent; p <= 0.05, corrected for 33)."""
+    """With the other three agents each method is better than fine-tuning between goals. Between image sets all but EWC
+    and CLEAR are better, with growing depth none (15 pairs, taken as independent; p <= 0.05, corrected for 33)."""
     every = {method for method in t.swept["method"] if method != "finetune"}
     found = better(t, "a2c", "dqn", "lstm_ppo", pairs=15)
     return found == {"4tasks": every, "4images": every - {"ewc", "clear"}, "depth2to5": set()}

@@ -124,14 +124,14 @@ def test_found_changes_and_other_alarms_are_counted_from_the_spans(made, masks):
     soon = " or ".join(str(made.soon(masks[name])) for name in ("swoks", "swoks, fresh"))
     chance = [1 - exp(-len(others[name]) / (5 * 8 * 384_000) * 65_536) for name in ("swoks", "swoks, fresh")]
     said = " or ".join(f"{100 * each:.0f} %" for each in chance)
-    assert f"SWOKS finds {soon} of 35 changes within 65,536 frames: its other alarms would find {said} by" in PAGE
+    assert f"SWOKS finds {soon} of 35 changes within 65,536 frames; its other alarms would find {said} by" in PAGE
     for name, share in zip(("swoks", "swoks, fresh"), chance, strict=True):
         assert made.soon(masks[name]) / 35 > 2 * share
         assert f"| {made.soon(masks[name])} of 35; {100 * share:.0f} % |" in PAGE
     number = {name: len(returns) for name, returns in others.items()}
-    both = [of["swoks"] + of["swoks, fresh"] for of in (number, false, high)]
-    said = f"Of its {both[0]} other alarms {both[1]} are false and {both[0] - both[1]} late, and {both[2]} come while"
-    assert f"{said} the return is at least 0.9" in PAGE
+    both = [of["swoks"] + of["swoks, fresh"] for of in (number, false)]
+    said = f"Of these {both[0]} alarms {both[1]} are false and {both[0] - both[1]} late."
+    assert said in PAGE
     fresh, published = ([of[name] for of in (false, number, high)] for name in ("swoks, fresh", "swoks"))
     assert (
         f"SWOKS: with fresh trials {fresh[0]} of its {fresh[1]} other alarms are false, and {fresh[2]} came while"
@@ -141,7 +141,7 @@ def test_found_changes_and_other_alarms_are_counted_from_the_spans(made, masks):
     second = next(span for span in spans[tuple(swoks[1][key] for key in RUN)] if int(span["end"]) > 442_368)
     assert (second["start"], second["label"], second["learned"]) == ("442368", "1", "True")
     assert f"label 1 was accepted {442_368 - 384_000:,} frames after the first change" in PAGE
-    assert f"of the 35 changes, none of which the images show, {soon} had an alarm" in PAGE
+    assert soon == "17 or 18" and "it finds half of the changes that images do not show" in PAGE  # of 35
 
     ends = {name: [float(line["average_performance"]) for line in masks[name]] for name in ("adwin", "swoks")}
     assert len(ends["adwin"]) == 5

@@ -42,9 +42,9 @@ def _() -> bool:
 
 
 @says(
-    "The paper's claim that masks know more at the end than EWC holds on CT8 multi-depth for Mask LC and Mask BLC; of "
-    "Mask RI 20 seeds cannot say it. On CT8 and CT12 it cannot be said of any: with one epoch EWC keeps all tasks, and "
-    "no method can know more."
+    "The paper claims that masks know more at the end than EWC. On CT8 multi-depth this holds for Mask LC and Mask "
+    "BLC; 20 seeds cannot decide it for Mask RI. On CT8 and CT12 no method can know more than EWC, which keeps all "
+    "tasks with one epoch."
 )
 def _() -> bool:
     of = Table("masks_ct8_md")
@@ -55,8 +55,8 @@ def _() -> bool:
 
 
 @says(
-    "Its claim that a combination of masks learns faster than new masks holds for Mask BLC on all three curricula, and "
-    "for Mask LC on CT8 multi-depth. On CT8 and CT12 ten seeds cannot order Mask LC and new masks."
+    "The paper claims that combined masks learn faster than new masks. This holds for Mask BLC on all three curricula "
+    "and for Mask LC on CT8 multi-depth. On CT8 and CT12 ten seeds cannot order Mask LC and new masks."
 )
 def _() -> bool:
     blc = [faster(name, "mask_blc") for name in MASKS]
