@@ -114,6 +114,17 @@ class DetectorLike(Protocol):
         ...
 
 
+class PlasticityLike(Protocol):
+    """Keeps an agent's network able to learn. `ctgraph_rl.run` builds it as ``Class(**yaml)``."""
+
+    needs_boundaries: bool
+    """Whether it acts at task changes, which must be announced."""
+
+    def attach(self, agent: Agent, curriculum: Curriculum) -> Agent:
+        """Return the agent with it; arguments and errors as in `MethodLike`, which is attached next."""
+        ...
+
+
 class MethodLike(Protocol):
     """A lifelong-learning method: it changes how an agent learns. `ctgraph_rl.run` builds it as ``Class(**yaml)``."""
 

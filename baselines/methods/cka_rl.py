@@ -42,6 +42,7 @@ class CKARL(TaskMethod):
     """
 
     stackable = of_one_seed = True
+    may_recycle = False
     counts = ("ended", "num_pooled")
     agent_members = (*TaskMethod.agent_members, "replace_optimiser")
 

@@ -16,6 +16,13 @@ from ctgraph_rl.checks import one_of, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 
+class Unchanged(Method):
+    """A method that does nothing: what tells an agent's plasticity when tasks start."""
+
+    stackable = True
+    needs_boundaries = False
+
+
 class Finetune(Method):
     """The agent learns one task after the other; nothing is stored while the trunk is trained.
 
@@ -38,10 +45,14 @@ class Finetune(Method):
         require(*one_of(("trained", "kept"), trunk=trunk))
         self.trunk = trunk
         self.needs_boundaries = trunk == "kept"
+        self.may_recycle = trunk == "trained"
 
     @override
     def attach(self, agent: Agent, curriculum: Curriculum) -> Agent:
-        return super().attach(agent, curriculum) if self.trunk == "kept" else agent
+        if self.trunk == "kept":
+            return super().attach(agent, curriculum)
+        plasticity = getattr(agent, "plasticity", None)
+        return Unchanged().attach(agent, curriculum) if getattr(plasticity, "needs_starts", False) else agent
 
     @override
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:

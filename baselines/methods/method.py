@@ -44,6 +44,9 @@ class Method(TakesNumbers, Hooks):
     max_labels: int | None = None
     """Most ids if they are a detector's labels; None: those of the curriculum's tasks."""
 
+    may_recycle: bool = True
+    """Whether a plasticity may draw some of the network's weights again: not where the method fixes or makes them."""
+
     agent_members: tuple[str, ...] = ("method", "weights")
     """Members of `Learner` that it uses beside those of `ctgraph_rl.agent.Agent`."""
 
@@ -99,6 +102,12 @@ class Method(TakesNumbers, Hooks):
         require(
             (not adapts, f"{name} learns tasks one after the other, and {learner} draws them: take method=finetune")
         )
+        plasticity = getattr(agent, "plasticity", None)
+        recycled = (
+            f"{name} fixes or makes weights, which {type(plasticity).__name__} would draw again: take plasticity=none, "
+            "or one that draws none, such as l2_init"
+        )
+        require((self.may_recycle or not getattr(plasticity, "recycles", False), recycled))
         for hook in ("penalties", "transform_gradients", "after_step"):
             taken = list(signature(getattr(self, hook)).parameters)
             rule = f"{name}.{hook} must take `weights`, those of the agent, as its last argument, got {taken}"
@@ -262,7 +271,8 @@ class AgentWithMethod(nn.Module):
         return self.agent.initial_state(num_envs)
 
     def start_task(self, task: int | None = None) -> None:
-        """Start a task, first for the method, then for the agent."""
+        """Start a task, for the plasticity, then the method, then the agent."""
+        self.agent.plasticity.start_task()
         self.method.start_task(task)
         self.agent.start_task(task)
 
@@ -272,8 +282,9 @@ class AgentWithMethod(nn.Module):
         self.method.end_task()
 
     def loss(self, batch: Mapping[Any, Tensor] | TensorDictBase) -> Mapping[str, Tensor]:
-        """Return the agent's losses and the method's penalties."""
-        return {**self.agent.loss(batch), **self.method.penalties(batch, self.agent.weights)}
+        """Return the agent's losses, and the penalties of plasticity and method."""
+        kept = self.agent.plasticity.penalties(batch, self.agent.weights)
+        return {**self.agent.loss(batch), **kept, **self.method.penalties(batch, self.agent.weights)}
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Show the method a batch, and learn from it."""

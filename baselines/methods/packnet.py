@@ -37,6 +37,7 @@ class PackNet(TaskMethod):
         retrain: share of a block's frames, at its end, that is trained after pruning, in [0, 1).
     """
 
+    may_recycle = False
     acts_on_batches = stackable = of_one_seed = True
     agent_members = Heads.agent_members
     reads_tasks = "the frames of each block"

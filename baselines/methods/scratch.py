@@ -6,9 +6,8 @@ from torch import Tensor
 from typing_extensions import override
 
 from baselines.methods.method import TaskMethod
-from baselines.methods.parts.weights import Weights
+from baselines.methods.parts.weights import Weights, require_drawn
 from baselines.parts.learner import Learner
-from ctgraph_rl.checks import require
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 
@@ -26,11 +25,7 @@ class Scratch(TaskMethod):
     @override
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         super().setup(agent, weights, curriculum)
-        fixed = []
-        for name, layer in agent.policy.named_modules():
-            if list(layer.parameters(recurse=False)) and not hasattr(layer, "reset_parameters"):
-                fixed.append(name or type(layer).__name__)
-        require((not fixed, f"Scratch draws weights again by reset_parameters, which {', '.join(fixed)} lack: add it"))
+        require_drawn(agent.policy, "Scratch")
         self.register_buffer("kept", weights.zeros().repeat(self.num_tasks, 1))
 
     @override

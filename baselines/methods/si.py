@@ -73,5 +73,10 @@ class SI(Importance):
         self.path -= self.slope * (flat(weights) - self.before)
 
     @override
+    def weights_rewritten(self, change: Tensor) -> None:
+        """Nothing was learned by it."""
+        self.start += change
+
+    @override
     def task_importance(self) -> Tensor:
         return self.path.clamp(min=0) / ((self.weights.vector().detach() - self.start).square() + self.epsilon)

@@ -62,7 +62,7 @@ def catalogue(group: str, config_dir: Path | None = None) -> Iterator[CatalogueE
         paths += sorted(Path(config_dir, group).glob("*.yaml"))
     for path in paths:
         text = path.read_text(encoding="utf-8")
-        settings = yaml.safe_load(text)
+        settings = yaml.safe_load(text) or {}
         if "_target_" in settings:
             target = settings.pop("_target_")
             settings.pop("_partial_", None)

@@ -1,10 +1,11 @@
-"""What a lifelong-learning method can change in a gradient step."""
+"""What lifelong-learning methods, and methods against lost plasticity, can change in a gradient step."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import ClassVar
 
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from baselines.parts.networks import Data, TensorsByName
@@ -51,3 +52,37 @@ class Hooks(nn.Module):
 
     def after_step(self, weights: Sequence[Tensor]) -> None:
         """Called after each step of the optimiser; may write the weights."""
+
+    def weights_rewritten(self, change: Tensor) -> None:
+        """Called after a plasticity changed the weights by this much between two gradient steps, float32 [P]."""
+
+
+class PlasticityHooks(nn.Module):
+    """Hooks that keep nothing plastic; a `Learner` calls them around each gradient step, in this order."""
+
+    stackable: bool = True
+    """Whether it acts on gradient steps by `penalties` alone, which several seeds can share."""
+
+    needs_starts: bool = False
+    """Whether `start_task` does anything."""
+
+    recycles: bool = False
+    """Whether it writes weights other than by the optimiser, which methods that fix weights refuse."""
+
+    def start_task(self) -> None:
+        """Called at the start of a task, before the method's."""
+
+    def on_batch(self, batch: TensorDictBase) -> None:
+        """Called with each batch, [num_envs, num_steps], before learning."""
+
+    def transform_minibatch(self, batch: Data) -> Data:
+        """Return the minibatch to learn from."""
+        return batch
+
+    def penalties(self, batch: Data, weights: Sequence[Tensor]) -> TensorsByName:
+        """Return scalars to add to the agent's losses, named ``loss_*``; arguments as in `Hooks`."""
+        return {}
+
+    def after_step(self, batch: Data, measured: TensorsByName) -> TensorsByName:
+        """Called after a gradient step with what it measured; may write the weights, and measure more."""
+        return measured

@@ -67,6 +67,7 @@ class Learner(TakesNumbers, Trained):
         Raises:
             FloatingPointError: names the first number that is not finite, or the largest weight.
         """
+        self.plasticity.on_batch(batch)
         steps = []
         shown = self.shown_ids(batch)
         with nullcontext() if shown is None else only_live_ids(self, shown):
@@ -90,7 +91,8 @@ class Learner(TakesNumbers, Trained):
 
     def gradient_step(self, batch: Data) -> TensorsByName:
         """Minimise the sum of a minibatch's losses by one step; return losses and ``grad_norm``."""
-        return take_step(self, self.method.transform_minibatch(batch))
+        batch = self.plasticity.transform_minibatch(self.method.transform_minibatch(batch))
+        return self.plasticity.after_step(batch, take_step(self, batch))
 
     def after_update(self, measured: TensorsByName) -> TensorsByName:
         """Called after a gradient step with its measurements; return those to log."""

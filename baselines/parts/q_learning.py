@@ -216,8 +216,7 @@ class QLearner(Learner):
             keys += module.out_keys
         self.policy = EpsilonGreedy(greedy, self.exploration, *copied, selected_out_keys=keys)
         self.greedy = greedy
-        self.target = deepcopy(greedy).requires_grad_(False)
-        self.target_age = 0
+        self.network_changed()
         self.optimiser = make_optimiser("adam", greedy.parameters(), self.settings.learning_rate)
 
     @override
@@ -229,6 +228,11 @@ class QLearner(Learner):
     @override
     def other_weights(self) -> TensorsByName:
         return {f"greedy.{name}": value for name, value in self.target.named_parameters()}
+
+    @override
+    def network_changed(self) -> None:
+        self.target = deepcopy(self.greedy).requires_grad_(False)
+        self.target_age = 0
 
     @override
     def weights_changed(self) -> None:

@@ -41,6 +41,9 @@ def why_not_captured(agent: Agent) -> str | None:
         return f"{name} cannot be vectorised over seeds on a GPU"
     if not has_stackable(learner, SHARED):
         return f"{name} does not learn by the steps that a batch of seeds shares"
+    if not learner.plasticity.stackable:
+        kept = type(learner.plasticity).__name__
+        return f"{kept} cannot be vectorised over seeds on a GPU: it acts between gradient steps"
     method = type(learner.method)
     if method.acts_on_batches or getattr(method, "after_learning", None) not in (None, Method.after_learning):
         return f"{method.__name__} cannot be vectorised over seeds on a GPU: it acts before or after a batch"

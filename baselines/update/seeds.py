@@ -80,7 +80,7 @@ class SeedGroup:
         self.learners = [learner_of(agent) for agent in agents]
         self.methods = [agent.method for agent in agents if isinstance(agent, AgentWithMethod)]
         self.first = self.learners[0]
-        self.is_stacked = _gains_from_stacking(self.first)
+        self.is_stacked = _gains_from_stacking(self.first) and self.first.plasticity.stackable
         self.most_at_once = _most_at_once(self.first) if self.first.compiled_step else len(self.agents)
         self._compiled: dict[str, Outputs] = {}
         self._stacks: list[Stack] = []

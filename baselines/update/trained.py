@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from typing_extensions import override
 
-from baselines.parts.hooks import Hooks
+from baselines.parts.hooks import Hooks, PlasticityHooks
 from baselines.parts.networks import Data, TensorsByName
 from ctgraph_rl.checks import NamedValues
 from ctgraph_rl.core.region import Region
@@ -37,6 +37,7 @@ class Trained(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.method = Hooks()
+        self.plasticity = PlasticityHooks()
         self.region: Region | None = None
         self._takes_others = "others" in signature(self.loss).parameters
 
@@ -45,14 +46,15 @@ class Trained(nn.Module):
         raise NotImplementedError
 
     def losses(self, batch: Data, weights: Sequence[Tensor], others: Data) -> TensorsByName:
-        """Return the agent's losses and the method's penalties.
+        """Return the agent's losses, and the penalties of plasticity and method.
 
         Args:
             weights: of the networks, by which the sum is differentiated.
             others: from `other_weights`, for a ``loss`` with an argument of this name.
         """
         own = self.loss(batch, others) if self._takes_others else self.loss(batch)  # type: ignore[call-arg]
-        return {**own, **self.method.penalties(batch, weights)}
+        kept = self.plasticity.penalties(batch, weights)
+        return {**own, **kept, **self.method.penalties(batch, weights)}
 
     def other_weights(self) -> TensorsByName:
         """Return the tensors that losses read in place of the learner's, by name: a target network's."""
@@ -94,6 +96,9 @@ class Trained(nn.Module):
 
     def weights_changed(self) -> None:
         """Called after weights were changed other than by learning."""
+
+    def network_changed(self) -> None:
+        """Called after layers were added to the policy."""
 
     @override
     def get_extra_state(self) -> NamedValues:

@@ -301,4 +301,5 @@ def update_state(learner: Trained) -> UpdateState:
 
 def is_captured(learner: Trained) -> bool:
     """Return whether steps are CUDA graphs: on GPUs, without a method."""
-    return learner.capturable and type(learner.method) is Hooks and captures(next(learner.parameters()).device)
+    plain = learner.capturable and type(learner.method) is Hooks and has_parts(learner.optimiser)
+    return plain and captures(next(learner.parameters()).device)

@@ -83,19 +83,26 @@ _PACKAGE = re.compile(r"(?:_target_|path): ['\"]?(\w+)")  # of a target, or of a
 
 
 def plain(cfg: DictConfig) -> NamedValues:
-    """Return the configuration as plain values, without Hydra's and those that do not change results."""
+    """Return the configuration as plain values, without Hydra's, those that do not change results, and empty groups."""
     kept = [str(key) for key in cfg if key != "hydra" and key not in NOT_HASHED]
-    return OmegaConf.to_container(OmegaConf.masked_copy(cfg, kept), resolve=True)  # type: ignore[return-value]
+    values: Any = OmegaConf.to_container(OmegaConf.masked_copy(cfg, kept), resolve=True)
+    return {key: value for key, value in values.items() if value != {}}
 
 
 def run_name(*, _root_: DictConfig) -> str:
-    """Name a run's directory: curriculum, agent; cell, method, detector and exchange if chosen; seed, a hash of all."""
+    """Name a run's directory: curriculum, agent; the other parts if chosen, such as a method; seed, a hash of all."""
     return name_of(_root_, _root_.hydra.runtime.choices)
 
 
 def name_of(cfg: DictConfig, choices: Any) -> str:
     """Return a configuration's run name, given each group's chosen file."""
-    parts = {"cell": (None, "lstm"), "method": ("finetune",), "detector": (None,), "exchange": (None, "null")}
+    parts = {
+        "cell": (None, "lstm"),
+        "method": ("finetune",),
+        "plasticity": (None, "none"),
+        "detector": (None,),
+        "exchange": (None, "null"),
+    }
     learner = choices.agent
     for group, usual in parts.items():
         if choices.get(group) not in usual:

@@ -48,7 +48,7 @@ from ctgraph_rl.runs.session import (
 from ctgraph_rl.runs.settings import as_before, differences, flat
 from ctgraph_rl.runs.status import holds_results
 from ctgraph_rl.runs.trackers import FOLDER, Tracker
-from ctgraph_rl.runs.train import MakeAgent, new_agent, with_method
+from ctgraph_rl.runs.train import MakeAgent, MakePlasticity, new_agent, with_method
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import changed
 
@@ -75,9 +75,9 @@ def build(cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None = None) ->
     curriculum = curriculum_of(cfg, make_method())
     for task in curriculum.tasks if cfg.experts else ():  # refuses first what an agent cannot learn
         new_agent(expert_curriculum(curriculum, task), make_alone, cfg.seed)
-    make_agent = with_method(make_alone, make_method, curriculum)
+    make_agent = with_method(make_alone, make_method, curriculum, plasticity_of(cfg))
     member = make_member(cfg, run_dir, curriculum, make_agent, settings=config.plain(cfg), interrupt=interrupt)
-    usual = "plasticity" in cfg and all(holds for holds, _ in unit_rules(curriculum, member.agent))
+    usual = bool(cfg.get("plasticity")) and all(holds for holds, _ in unit_rules(curriculum, member.agent))
     member.log_units = usual if cfg.log_units is None else cfg.log_units
     if member.log_units:
         require(*unit_rules(curriculum, member.agent))
@@ -206,6 +206,8 @@ def make_agent(
     *,
     method: str | None = None,
     method_settings: ReadOnlyValues | None = None,
+    plasticity: str | None = None,
+    plasticity_settings: ReadOnlyValues | None = None,
     detector: str | None = None,
     cell: str | None = None,
     device: torch.device | str | None = None,
@@ -224,6 +226,8 @@ def make_agent(
         seed: decides the weights and torch's global generator, in [0, 2**63); None: as on the command line.
         method: of a file in ``conf/method``, such as ``"ewc"``; None: as on the command line.
         method_settings: replace those of the method's file, such as ``{"coeff": 50.0}``.
+        plasticity: of a file in ``conf/plasticity``, such as ``"redo"``; None: as on the command line.
+        plasticity_settings: replace those of its file.
         detector: of a file in ``conf/detector``, such as ``"swoks"``; None: without.
         cell: of a file in ``conf/cell``, such as ``"gru"``; None: as on the command line.
         device: where the agent lives; None: as on the command line.
@@ -241,12 +245,14 @@ def make_agent(
         256
     """
     require((isinstance(curriculum, Curriculum), f"curriculum must be a Curriculum, got {curriculum!r:.80}"))
-    names = {"agent": name, "method": method, "detector": detector, "cell": cell}
+    names = {"agent": name, "method": method, "plasticity": plasticity, "detector": detector, "cell": cell}
     cfg = config.with_names(names, None if config_dir is None else Path(config_dir))
     cfg.seed = cfg.seed if seed is None else seed
     cfg.device = cfg.device if device is None else str(device)
-    for group, values in (("agent", settings), ("method", plain(method_settings or {}))):
-        cfg[group] = {**cfg[group], **values}
+    for group, values in (("agent", settings), ("method", method_settings), ("plasticity", plasticity_settings)):
+        if values:
+            require((bool(cfg.get(group)), f"{group}_settings are those of a {group}: give {group}=NAME, too"))
+            cfg[group] = {**cfg[group], **plain(values)}
     config.check_values(cfg)
     prepare_torch(cfg)
     make_method = method_of(cfg)
@@ -256,7 +262,8 @@ def make_agent(
         f"{kind} learns another curriculum: replace yours by {kind}(...).prepare(curriculum), here and where it is used"
     )
     require((make_method().prepare(curriculum) == curriculum, other))
-    return new_agent(curriculum, with_method(make_alone, make_method, curriculum), cfg.seed, checked_device(cfg.device))
+    make = with_method(make_alone, make_method, curriculum, plasticity_of(cfg))
+    return new_agent(curriculum, make, cfg.seed, checked_device(cfg.device))
 
 
 def method_of(cfg: DictConfig) -> Callable[[], MethodLike]:
@@ -266,6 +273,18 @@ def method_of(cfg: DictConfig) -> Callable[[], MethodLike]:
         return make_method
     make_detector = config.target(cfg, "detector")
     return lambda: make_detector().labelling(make_method())
+
+
+def plasticity_of(cfg: DictConfig) -> MakePlasticity | None:
+    """Return what builds a configuration's plasticity, if it has one.
+
+    Raises:
+        ValueError: with an exchange, whose tables name none.
+    """
+    if not cfg.get("plasticity"):
+        return None
+    require(("exchange" not in cfg, "an exchange takes no plasticity: set plasticity=none, or leave the exchange out"))
+    return config.target(cfg, "plasticity")
 
 
 def prepare_torch(cfg: DictConfig) -> None:
@@ -464,7 +483,7 @@ def changed_code(cfg: DictConfig, run_dir: Path, known: dict[str, NamedValues]) 
 def code_of(cfg: DictConfig, known: dict[str, NamedValues]) -> NamedValues:
     """Return `ctgraph_rl.log.provenance.code` of a configuration's run."""
     settings = config.plain(cfg)
-    deciding = {key: settings.get(key) for key in ("curriculum", "method", "detector", *config.PARTS)}
+    deciding = {key: settings.get(key) for key in ("curriculum", "method", "plasticity", "detector", *config.PARTS)}
     key = json.dumps([deciding, learners(settings, None)], sort_keys=True)
     if key not in known:
         with suppress(Exception):  # of the code of a user; once imported it may find more modules

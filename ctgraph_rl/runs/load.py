@@ -32,10 +32,11 @@ from ctgraph_rl.tasks.kinds.task_like import TaskLike
 OURS = {
     "agent": re.compile(r"(baselines\.\w+)\.(\w+)"),
     "method": re.compile(r"(baselines\.methods\.\w+)\.(\w+)"),
+    "plasticity": re.compile(r"(baselines\.plasticity\.\w+)\.(\w+)"),
     "cell": re.compile(r"(baselines\.cells\.\w+)\.(\w+)"),
     "detector": re.compile(r"(baselines\.detectors\.\w+)\.(\w+)"),
 }
-"""Agents, methods, cells and detectors that a directory may name."""
+"""Agents and their parts that a directory may name."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +132,10 @@ def _builder(
         make_method = _ours(run_dir, "method", stored["method"])
     else:
         return alone
-    return with_method(alone, partial(_labelled, run_dir, make_method, stored["detector"]), curriculum)
+    plasticity = stored["plasticity"]
+    make_plasticity = None if plasticity is None else _ours(run_dir, "plasticity", plasticity)
+    labelled = partial(_labelled, run_dir, make_method, stored["detector"])
+    return with_method(alone, labelled, curriculum, make_plasticity)
 
 
 def _labelled(run_dir: Path, make_method: Callable[[], MethodLike], detector: Any) -> MethodLike:

@@ -353,11 +353,12 @@ def _about(file: Path) -> NamedValues:
 
 
 def _agent(config: ReadOnlyValues) -> str | None:
-    """Return agent, unusual cell, method and detector, by classes or the recorder's names."""
+    """Return agent, unusual cell, method, plasticity and detector, by classes or the recorder's names."""
     learner = config.get("agent")
     agent = called(learner) or called(config.get("learner"))
     cell = called(learner.get("cell")) if isinstance(learner, Mapping) else None
-    parts = (agent, cell, called(config.get("method")), called(config.get("detector")))
+    others = [called(config.get(part)) for part in ("method", "plasticity", "detector")]
+    parts = (agent, cell, *others)
     return " + ".join(filter(None, parts)) if agent else agent
 
 

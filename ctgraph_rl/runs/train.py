@@ -10,7 +10,7 @@ import torch
 from rich.console import Console
 from torchrl.data import Composite, TensorSpec
 
-from ctgraph_rl.agent import Agent, MethodLike
+from ctgraph_rl.agent import Agent, MethodLike, PlasticityLike
 from ctgraph_rl.batch.rows import seed_rule
 from ctgraph_rl.checks import (
     NamedValues,
@@ -35,6 +35,9 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 
 MakeAgent = Callable[[Composite, TensorSpec], Agent]
 """Builds an agent of unbatched observation and action specs."""
+
+MakePlasticity = Callable[[], PlasticityLike]
+"""Builds a plasticity."""
 
 MEMBERS = (
     *("num_envs", "num_steps", "policy", "policy_for", "initial_state"),
@@ -92,11 +95,21 @@ def _takes_specs(make_agent: Callable[..., object]) -> Rule:
     return True, ""
 
 
-def with_method(make_agent: MakeAgent, make_method: Callable[[], MethodLike], curriculum: Curriculum) -> MakeAgent:
-    """Return a function that builds an agent with a new method."""
-    return lambda observation_spec, action_spec: make_method().attach(
-        make_agent(observation_spec, action_spec), curriculum
-    )
+def with_method(
+    make_agent: MakeAgent,
+    make_method: Callable[[], MethodLike],
+    curriculum: Curriculum,
+    make_plasticity: MakePlasticity | None = None,
+) -> MakeAgent:
+    """Return a function that builds an agent with a new plasticity, if any, and a new method."""
+
+    def make(observation_spec: Composite, action_spec: TensorSpec) -> Agent:
+        agent = make_agent(observation_spec, action_spec)
+        if make_plasticity is not None:
+            agent = make_plasticity().attach(agent, curriculum)
+        return make_method().attach(agent, curriculum)
+
+    return make
 
 
 @takes_numbers

@@ -1,4 +1,4 @@
-"""Test classes for tasks, environments, agents and methods of your own: inherit one, and pytest runs its tests.
+"""Test classes for your own tasks, environments, agents, methods and plasticities: inherit one, and pytest runs it.
 
 It imports no pytest; our own tests inherit the same classes.
 """
@@ -7,3 +7,4 @@ from ctgraph_rl.testing.environments import EnvironmentContract as EnvironmentCo
 from ctgraph_rl.testing.environments import TaskContract as TaskContract
 from ctgraph_rl.testing.learners import AgentContract as AgentContract
 from ctgraph_rl.testing.learners import MethodContract as MethodContract
+from ctgraph_rl.testing.learners import PlasticityContract as PlasticityContract

@@ -1,4 +1,4 @@
-"""Tests of every agent and lifelong-learning method, by `ctgraph_rl.agent`."""
+"""Tests of every agent, lifelong-learning method and plasticity, by `ctgraph_rl.agent`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from ctgraph_rl.agent import Agent, MethodLike
+from ctgraph_rl.agent import Agent, MethodLike, PlasticityLike
 from ctgraph_rl.learn.collect import agent_specs, make_env
 from ctgraph_rl.learn.lifelong import learn_curriculum
 from ctgraph_rl.log.run_log import RunLog
@@ -122,6 +122,47 @@ class MethodContract(AgentContract):
     def build(self, curriculum: Curriculum, seed: int = 0) -> Agent:
         """Return a new agent with the method."""
         return new_agent(curriculum, with_method(self.make_agent, self.make_method, curriculum), seed)
+
+
+class PlasticityContract(MethodContract):
+    """Tests of a plasticity on an agent. Override `make_agent`, `make_method`, such as ``Finetune``, and
+    `make_plasticity`.
+    """
+
+    def make_plasticity(self) -> PlasticityLike:
+        """Return a new plasticity."""
+        raise NotImplementedError
+
+    def build(self, curriculum: Curriculum, seed: int = 0) -> Agent:
+        """Return a new agent with the plasticity, and the method."""
+        make = with_method(self.make_agent, self.make_method, curriculum, self.make_plasticity)
+        return new_agent(curriculum, make, seed)
+
+    def test_it_leaves_all_other_draws(self) -> None:
+        """Of torch's global generator, after building and after learning."""
+        curriculum = self.curriculum()
+        plain = new_agent(curriculum, with_method(self.make_agent, self.make_method, curriculum), 0)
+        states = [torch.get_rng_state()]
+        learn_curriculum(curriculum, plain)
+        states.append(torch.get_rng_state())
+        agent = self.build(curriculum)
+
+        assert torch.equal(torch.get_rng_state(), states[0])
+        learn_curriculum(curriculum, agent)
+        assert torch.equal(torch.get_rng_state(), states[1])
+
+    def test_hidden_task_changes_are_refused_by_name_or_learned(self) -> None:
+        """By the plasticity, before any work."""
+        hidden = replace(self.curriculum(), protocol=Protocol(boundaries="hidden"))
+        if not self.make_plasticity().needs_boundaries:
+            learn_curriculum(hidden, self.build(hidden))
+            return
+        try:
+            self.build(hidden)
+        except ValueError as error:
+            assert type(self.make_plasticity()).__name__ in str(error)
+        else:
+            raise AssertionError("it was built without announced task changes")
 
 
 def _bytes(state: Any) -> bytes:

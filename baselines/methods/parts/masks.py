@@ -34,6 +34,7 @@ class Masks(TaskMethod):
     """
 
     stackable = True
+    may_recycle = False
     counts = ("ended",)
     agent_members = (*TaskMethod.agent_members, "replace_optimiser")
 

@@ -85,6 +85,15 @@ class Weights:
         write_flat(vector, [parameters[name] for name in self.names])
 
 
+def require_drawn(policy: nn.Module, name: str) -> None:
+    """Require layers whose weights can be drawn again, for a method of this name."""
+    fixed = []
+    for path, layer in policy.named_modules():
+        if list(layer.parameters(recurse=False)) and not hasattr(layer, "reset_parameters"):
+            fixed.append(path or type(layer).__name__)
+    require((not fixed, f"{name} draws weights again by reset_parameters, which {', '.join(fixed)} lack: add it"))
+
+
 def flat(tensors: Sequence[Tensor]) -> Tensor:
     """Concatenate tensors to one vector."""
     return torch.cat([tensor.flatten() for tensor in tensors])
