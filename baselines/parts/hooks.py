@@ -61,7 +61,7 @@ class PlasticityHooks(nn.Module):
     """Hooks that keep nothing plastic; a `Learner` calls them around each gradient step, in this order."""
 
     stackable: bool = True
-    """Whether it acts on gradient steps by `penalties` alone, which several seeds can share."""
+    """Whether it acts on gradient steps by `penalties` only, which several seeds can share."""
 
     needs_starts: bool = False
     """Whether `start_task` does anything."""
