@@ -46,7 +46,10 @@ SCORE = "average_performance"
 """The metric that is compared unless a track names another."""
 
 BYTES = "bytes of the agent"
-"""The check of what is equal also where bits differ."""
+"""The check of what is alike also where bits differ."""
+
+OTHER_SIZE = 0.1
+"""Largest change of an agent's bytes, as a share, where bits may differ: other versions keep numbers in other forms."""
 
 NOT_OF_THE_RUN = ("MemoryError", "ModuleNotFoundError")
 """Errors that limits and missing code cause here."""
@@ -237,7 +240,9 @@ def why_other_bits(submission: Submission, runs: Sequence[SubmittedRun]) -> list
     return list(dict.fromkeys(reasons))
 
 
-def checks_of(run: SubmittedRun, submitted: RunLog, result: Rerun, experts: Sequence[RunLog] = ()) -> list[Check]:
+def checks_of(
+    run: SubmittedRun, submitted: RunLog, result: Rerun, experts: Sequence[RunLog] = (), other_bits: Sequence[str] = ()
+) -> list[Check]:
     """Compare a submitted run with what was learned again, bit by bit.
 
     A run that cannot finish here, or failed without failing by itself, decides nothing: the machine or a limit may be
@@ -253,7 +258,7 @@ def checks_of(run: SubmittedRun, submitted: RunLog, result: Rerun, experts: Sequ
     log = equal("log of the rerun", run.log_sha256, log_sum(result.log), run.run)
     note = "" if log.passed else first_difference(submitted, result.log)
     checks = [log._replace(note=note), equal("agent of the rerun", run.agent_sha256, result.agent_sha256, run.run)]
-    checks.append(equal(BYTES, run.agent_bytes, result.agent_bytes, run.run))
+    checks.append(_size_check(run, result.agent_bytes, other_bits))
     pairs = zip_longest(map(log_sum, experts), map(log_sum, result.experts), fillvalue="none")
     for number, (one, other) in enumerate(pairs, 1):
         checks.append(equal(f"log of expert {number} of the rerun", one, other, run.run))
@@ -292,6 +297,13 @@ def submitted_scores(submission: Submission) -> list[float]:
     return found
 
 
+def _size_check(run: SubmittedRun, found: int | None, other_bits: Sequence[str]) -> Check:
+    if not other_bits or run.agent_bytes is None or found is None:
+        return equal(BYTES, run.agent_bytes, found, run.run)
+    alike = abs(found - run.agent_bytes) <= OTHER_SIZE * run.agent_bytes
+    return Check(BYTES, f"{run.agent_bytes}, within {OTHER_SIZE:.0%}", str(found), alike, run.run)
+
+
 def check_of_scores(submission: Submission, found: Sequence[float], what: str, level: str, note: str = "") -> Check:
     """Test whether scores are lower than the submitted ones, and say what the test could find.
 
@@ -325,7 +337,7 @@ def verified(submission: Submission, results: Mapping[SubmittedRun, Rerun], othe
     for run, result in results.items():
         log = submission.log(run)
         experts = submission.experts(run, log) if run.finished else None
-        checks = checks_of(run, log, result, experts or ())
+        checks = checks_of(run, log, result, experts or (), other_bits)
         every += checks
         wrong = [check for check in checks if check.passed is False and check.what != BYTES]
         if run.finished and wrong and result.log is not None and other_bits:

@@ -229,6 +229,10 @@ def test_where_bits_are_not_promised_scores_are_tested_and_the_power_is_stated(
 
     assert check.passed is passed
     assert ({size.what for size in sizes}, all(size.passed for size in sizes)) == ({rerun.BYTES}, True)
+    for share, alike in ((1.09, True), (0.89, False), (1.11, False)):
+        grown = other._replace(agent_bytes=int(run.agent_bytes * share))
+        size = next(each for each in rerun.checks_of(run, RunLog(), grown, (), ["numbers"]) if each.what == rerun.BYTES)
+        assert size.passed is alike
     assert (undecided.what, undecided.passed) == ("rerun", None)
     assert check.note == "bits differ, as they may with cpu A there, B here"
     assert ("would be found with 80% chance" if passed is not None else "cannot show any drop") in check.found
