@@ -283,7 +283,7 @@ def test_seeds_together_learn_as_runs_alone_do_and_the_page_says_what_would_have
     assert {agent for agent, _ in found} == {"ppo", "ppo_published", "ppo_count", "a2c", "reinforce", "dqn"}
     assert {(len(alone), len(together)) for _, alone, together in found.values()} == {(30, 30)}
     assert sizes == {("alone", "1"), ("together", "30")}
-    assert f"the lowest p of twelve paired tests is {min(each.p_value for each, *_ in found.values()):.2f}" in TOGETHER
+    assert f"The lowest p of twelve paired tests is {min(each.p_value for each, *_ in found.values()):.2f}" in TOGETHER
     less = [found[name, "final_return"][0].difference.shown for name in ("ppo", "ppo_count", "ppo_published")]
     assert "are {} for PPO, {} with counts and {} for `ppo_published`.".format(*less) in TOGETHER
     equal = {agent: {each.ties for (name, _), (each, *_) in found.items() if name == agent} for agent, _ in found}

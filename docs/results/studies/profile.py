@@ -116,7 +116,7 @@ def page() -> str:
     absolute = []
     for prop in properties():
         rows.append([prop.title, *(str(by_title[prop.title]) for by_title in found.values())])
-        absolute.append([prop.title, *(by_title[prop.title].absolute for by_title in found.values())])
+        absolute.append(measured(prop.title, [by_title[prop.title].absolute for by_title in found.values()]))
     head = ["property", *(AGENTS[agent] for agent in found)]
     gaps: dict[tuple[str, str], list[str]] = {}
     for agent, by_title in found.items():
@@ -135,6 +135,19 @@ def page() -> str:
         gaps="\n".join(lines),
         machines=machines(NAME),
     )
+
+
+def measured(title: str, cells: list[str]) -> list[str]:
+    """Return a row of values; floor and optimum stand with the title where they are the same for all agents."""
+    values = []
+    others = set()
+    for cell in cells:
+        value, _, other = cell.partition(", ")
+        values.append(value)
+        others.add(other)
+    if len(others) > 1 or others == {""}:
+        return [title, *cells]
+    return [f"{title}, {others.pop()}", *values]
 
 
 def draw() -> None:

@@ -174,7 +174,7 @@ def test_with_longer_stays_all_detectors_keep_both_graphs_at_their_price(made):
     for name in ("swoks, fresh", "adwin"):
         for key in ("frames_not_learned", "frames_rolled_back"):
             assert {round(float(line[key]) / float(line["frames"]), 2) for line in long[name]} == {0.1}
-    assert "a tenth of the frames is not learned from, and a tenth undone" in PAGE
+    assert "A tenth of the frames is not learned from, and a tenth undone" in PAGE
     free = {(line["frames_not_learned"], line["frames_rolled_back"], line["delays"]) for line in long["amd"]}
     assert free == {("0.0", "0.0", "16384")} and "pays with its delay of two batches only" in PAGE
 
