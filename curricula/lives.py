@@ -16,6 +16,8 @@ VERSION = 1
 
 SOURCE = "ctgraph_rl, after Mesbahi et al. 2025, arXiv 2404.02113"
 
+CONFLICT = "ctgraph_rl, after Abbas et al. 2023, arXiv 2303.07507"
+
 EVALUATIONS = 8
 """Of a block, the last at its end."""
 
@@ -48,7 +50,8 @@ def stream(
         num_tasks: tasks of the life, one a block, at most 100,000.
         num_frames: frames per block.
         order: ``similar``, all on one image set; ``dissimilar``, each on another; ``returning``, as dissimilar, but a
-            share comes again; ``drifting``, one decision or the image set changes at a time.
+            share comes again; ``drifting``, one decision or the image set changes at a time; ``conflicting``, on one
+            image set, all decisions change at a time.
         share: of blocks with a task that returns, in (0, 1].
         lag: blocks between a task and its return.
         seed: draws the tasks; None: the run's seed, so that seeds have different lives.
@@ -90,9 +93,26 @@ def stream(
     return Stream("stream", VERSION, SOURCE, blocks, Evaluation(every=every, tasks="seen", exact=True))
 
 
+def goal_conflict(num_frames: int = 98_304, depth: int = 3, num_tasks: int = 2, seed: int | None = None) -> Curriculum:
+    """Two goals on the same images that disagree at every decision: does the first slow down the second?
+
+    Evaluation samples actions, so that a success rate is no coin, 48 times a block if ``num_frames`` is a multiple.
+
+    Args:
+        num_frames: frames per goal.
+        depth: decisions to the goal.
+        num_tasks: goals.
+        seed: draws images and goals; None: the run's seed, so that seeds have different ones.
+    """
+    life = stream(num_tasks, num_frames, "conflicting", seed=seed, depth=depth).blocks
+    every = num_frames // 48 if num_frames % 48 == 0 else 0
+    how = Evaluation(greedy=False, every=every, tasks="seen", exact=True)
+    return Stream("goal_conflict", 1, CONFLICT, life, how)  # type: ignore[arg-type]
+
+
 def _several(value: object) -> tuple[object, ...]:
     listed = as_tuple(value)
     return listed if isinstance(listed, tuple) else (listed,)
 
 
-NAMED = by_name(stream)
+NAMED = by_name(goal_conflict, stream)

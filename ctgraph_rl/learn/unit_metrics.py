@@ -139,8 +139,8 @@ def fresh_images(task: Task) -> Tensor | None:
 def unit_rules(curriculum: Curriculum, agent: Agent) -> Iterator[Rule]:
     """Yield what metrics of units require."""
     off = "set log_units=false"
-    kind = type(curriculum.tasks[0]).__name__
-    yield are_graphs(curriculum.tasks), f"log_units needs CT-graphs, whose images are known, got {kind}: {off}"
+    kind = type(curriculum.examples[0]).__name__
+    yield are_graphs(curriculum.examples), f"log_units needs CT-graphs, whose images are known, got {kind}: {off}"
     learner = getattr(agent, "unwrapped", agent)
     name = type(learner).__name__
     known = hasattr(learner, "activations")

@@ -87,6 +87,10 @@ NOWHERE = (None,) * 6
 """Place of a whole run's numbers."""
 
 
+UNIT_METRICS = {"dead": "dead units", "dormant_0.1": "dormant units (0.1)", "rank_effective": "effective rank"}
+"""Metrics of hidden units in figures, with their names."""
+
+
 class History(NamedTuple):
     """A run's measurements of the curriculum's own tasks."""
 
@@ -96,6 +100,7 @@ class History(NamedTuple):
     performance: list[list[float]]  # mean return [blocks + 1][tasks]; NaN where not evaluated
     evaluations: Mapping[str, Curve]  # by label
     training: Mapping[int, Curve]  # by block, of finished episodes
+    units: Mapping[str, Curve]  # of `UNIT_METRICS`, on fresh images; empty where they were not measured
     spans: tuple[Span, ...]  # of labels that the learner gave tasks itself
     adaptation: Mapping[str, Adaptation]  # the last one, of ``trained`` and ``held-out`` tasks as far as there is one
     seconds: float
@@ -400,6 +405,10 @@ def _history(log: RunLog, values: Sequence[Value]) -> History:
         elif metric == "training_return_mean" and block is not None and value is not None:
             training.setdefault(block, []).append((frames, value))
     adapted = {"trained": log.adaptation(), "held-out": log.adaptation(held_out=True)}
+    units: dict[str, Curve] = {}
+    for line in log.of_kind("units"):
+        for name in UNIT_METRICS if line["images"] == "fresh" and line["moment"] != "start" else ():
+            units.setdefault(name, []).append((line["frames"], line[name]))
     experts_together: list[bool] = []
     for line in log.of_kind("experts"):
         experts_together += ["together" in each for each in line["experts"]]
@@ -410,6 +419,7 @@ def _history(log: RunLog, values: Sequence[Value]) -> History:
         performance=performance,
         evaluations=evaluations,
         training=training,
+        units=units,
         spans=label_spans(log),
         adaptation={name: found for name, found in adapted.items() if found is not None},
         seconds=log.measurements[-1].get("seconds", 0.0),

@@ -16,7 +16,7 @@ from ctgraph_rl.tasks.task import Task
 
 Made = TypeVar("Made")
 
-ORDERS = ("similar", "dissimilar", "returning", "drifting")
+ORDERS = ("similar", "dissimilar", "returning", "drifting", "conflicting")
 
 MOST_STREAMED = 100_000
 """Most tasks of a stream."""
@@ -84,7 +84,8 @@ class Life(Sequence[Block]):
 
     Orders: ``similar`` tasks share one image set, and neighbours differ otherwise; of ``dissimilar`` ones each has
     another image set; ``returning``: as dissimilar, but ``share`` of the blocks have the task of ``lag`` blocks before;
-    ``drifting``: a task has another image set than the one before, or one other decision on the way to its goal.
+    ``drifting``: a task has another image set than the one before, or one other decision on the way to its goal;
+    ``conflicting``: all on one image set, each goal another one than before at every decision.
 
     Args:
         choices: the tasks from which all but the image set is drawn.
@@ -135,13 +136,16 @@ class Life(Sequence[Block]):
         many_images = len(images) != 1 and all(task.image_seed is not None for task in self.choices)
         several = len(self.choices) > 1
         returns = f"lag={self.lag} must be less than num_tasks={self.num_tasks}, else no task returns"
+        one_set = self.order in ("similar", "conflicting")
         drifts = not several or all(self._neighbours.values())
         fix = "needs goals that differ in one decision: give goals=all, or one goal"
+        every = "needs goals that differ in every decision: give goals=all, or two goals such as [1.1,2.2]"
         require(
-            (self.order == "similar" or many_images, f"order={self.order} needs several generated image sets"),
+            (one_set or many_images, f"order={self.order} needs several generated image sets"),
             (self.order != "similar" or several, "order=similar needs tasks that differ in more than their images"),
             (self.order != "returning" or self.lag < self.num_tasks, returns),
             (self.order != "drifting" or drifts, f"order=drifting {fix}"),
+            (self.order != "conflicting" or all(self._opposites.values()), f"order=conflicting {every}"),
         )
 
     @cached_property
@@ -160,8 +164,22 @@ class Life(Sequence[Block]):
         return found
 
     @cached_property
+    def _opposites(self) -> dict[int, list[int]]:
+        """For each choice, those on its graph that differ from it at every decision."""
+        found: dict[int, list[int]] = {}
+        for place, task in enumerate(self.choices):
+            found[place] = []
+            for other, another in enumerate(self.choices):
+                disagree = all(own != its for own, its in zip(task.goal, another.goal, strict=False))
+                if disagree and replace(another, goal=task.goal) == task:
+                    found[place].append(other)
+        return found
+
+    @cached_property
     def _draws(self) -> _Draws:
-        return _Draws(self, self._neighbours if self.order == "drifting" else {})
+        if self.order == "drifting":
+            return _Draws(self, self._neighbours)
+        return _Draws(self, self._opposites if self.order == "conflicting" else {})
 
     @cached_property
     def tasks(self) -> DrawnTasks:
@@ -228,6 +246,9 @@ class _Draws:
         elif life.order == "similar":
             other = (self._choices[-1] + 1 + self._below(len(life.choices) - 1)) % len(life.choices)
             self._add(other, self._images[-1], place)
+        elif life.order == "conflicting":
+            others = self.neighbours[self._choices[-1]]
+            self._add(others[self._below(len(others))], self._images[-1], place)
         elif life.order == "drifting":
             others = self.neighbours[self._choices[-1]]
             depth = len(life.choices[self._choices[-1]].goal)

@@ -122,7 +122,10 @@ def test_the_present_task_is_evaluated_and_at_a_blocks_end_the_next_and_earlier_
         ({"share": 0.0}, r"share must be in \(0, 1\], got 0.0"),
         ({"share": 1.5}, r"share must be in \(0, 1\], got 1.5"),
         ({"num_tasks": 100_001}, "num_tasks must be in 1..100,000, got 100001"),
-        ({"order": "random"}, "order must be one of similar, dissimilar, returning, drifting, got 'random'"),
+        (
+            {"order": "random"},
+            "order must be one of similar, dissimilar, .*, conflicting, got 'random'",
+        ),
         ({"order": "returning", "lag": 40}, "lag=40 must be less than num_tasks=40"),
         ({"seed": -1}, r"seed must be an integer in \[0, 2\*\*63\) or null, got -1"),
         ({"image_seeds": 3}, "order=dissimilar needs several generated image sets"),

@@ -10,6 +10,7 @@ import numpy as np
 
 from ctgraph_rl.log.escape import figure_text, terminal_text
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, left_out
+from ctgraph_rl.report.intervals import Bounds
 from ctgraph_rl.report.sections import (
     FEWEST_FOR_BANDS,
     Point,
@@ -21,7 +22,7 @@ from ctgraph_rl.report.sections import (
     training_curve,
 )
 from ctgraph_rl.report.style import MOST_AGENTS, agent_style, agents_legend, beside, frames_axis, panels, short
-from ctgraph_rl.runs.read import histories
+from ctgraph_rl.runs.read import UNIT_METRICS, histories
 
 MOST_TASKS = 32
 
@@ -107,6 +108,25 @@ def training_curves(section: Section) -> CaptionedFigure | None:
         _draw(axes, agent_style(position, result.agent), pieces, seeds)
     figure = _finished(grid, section, "return while training")
     return CaptionedFigure("training", "Return while training", caption, figure)
+
+
+def unit_curves(section: Section) -> CaptionedFigure | None:
+    """Return all agents' silent units and ranks over the life; None where no run measured units."""
+    if not any(history.units for history in histories(section.finished)):
+        return None
+    caption = (
+        f"Hidden units on 256 fresh images, as shares of all units and of the largest rank. {_agents(section)} Lines: "
+        f"means over seeds; bands: {BANDS}; thin lines: single seeds, up to {MOST_SEEDS}. Dashed: ends of blocks."
+    )
+    grid = panels(len(UNIT_METRICS), len(UNIT_METRICS), 1.9, sharex=True, sharey=True)
+    for axes, (name, title) in zip(grid.ravel(), UNIT_METRICS.items(), strict=True):
+        _mark_blocks(axes, section, None)
+        for position, result in enumerate(section.results[:MOST_AGENTS]):
+            seeds = [history.units[name] for history in histories(result.finished) if name in history.units]
+            look = agent_style(position, result.agent)
+            _draw(axes, look, [over_seeds(seeds, Bounds(0, 1))], seeds if len(seeds) <= MOST_SEEDS else [])
+        axes.set_title(title)
+    return CaptionedFigure("units", "Hidden units", caption, _finished(grid, section, "share"))
 
 
 def _training(result: Result, blocks: Sequence[tuple[int, tuple[int, int]]], places: int) -> list[list[Point]]:

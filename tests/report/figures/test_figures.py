@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from types import SimpleNamespace
 
@@ -20,7 +21,7 @@ from matplotlib.colors import to_rgb
 from ctgraph_rl.report.figures import heatmaps
 from ctgraph_rl.report.figures.heatmaps import draw_matrices
 from ctgraph_rl.report.figures.labels import label_strips
-from ctgraph_rl.report.figures.learning_curves import learning_curves, mean_curves, training_curves
+from ctgraph_rl.report.figures.learning_curves import learning_curves, mean_curves, training_curves, unit_curves
 from ctgraph_rl.report.style import contrast, ink, style
 from ctgraph_rl.report.terminal import label_notes
 
@@ -157,3 +158,19 @@ def test_the_caption_of_a_map_tells_of_intervals_up_to_the_last_that_has_them(mo
     section, result = SimpleNamespace(labels=("task",) * number), SimpleNamespace(agent="ppo", n=3)
 
     assert ("In brackets" in heatmaps.transfer_maps(section, result, {}).caption) == said
+
+
+def test_units_are_drawn_over_the_life_on_fresh_images_where_they_were_measured(tmp_path):
+    path = write_run(tmp_path / "0")
+    assert unit_curves(sections(find_runs([tmp_path])[0])[0]) is None
+
+    measured = {"kind": "units", "dead": 0.25, "dormant_0.1": 0.5, "rank_effective": 0.75}
+    with (path / "run.jsonl").open("a") as file:
+        for moment, images, frames in (("start", "fresh", 0), ("during", "task", 250), ("end", "fresh", 1000)):
+            line = {**measured, "block": 1, "frames": frames, "moment": moment, "images": images}
+            file.write(json.dumps(line) + "\n")
+    with style():
+        panels = unit_curves(sections(find_runs([tmp_path])[0])[0]).figure.axes
+
+    drawn = [[tuple(zip(*line.get_data(), strict=True)) for line in axes.lines][1:] for axes in panels]
+    assert drawn == [[((1000, 0.25),)], [((1000, 0.5),)], [((1000, 0.75),)]]
