@@ -91,7 +91,7 @@ def verdicts(found: dict[str, dict[str, Score]]) -> str:
         only = [title for title in mean[agent] if title not in certain[agent]]
         line = f"- **{AGENTS[agent]}** ({seeds} seeds) is above the floor in {_listed(certain[agent])}."
         if only:
-            line += f" In {_listed(only)} only its mean is."
+            line += f" Its mean, but not its interval, is above the floor in {_listed(only)}."
         lines.append(line)
     return "\n".join(lines)
 

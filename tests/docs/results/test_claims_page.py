@@ -62,7 +62,7 @@ def test_the_page_is_that_of_its_template_and_raw_results():
 
 def test_each_of_nine_sentences_has_tests_whose_verdicts_are_counted(rows):
     counts = Counter(row.verdict for row in rows)
-    words = f"{counts[AGREES]} agree, {counts[DISAGREES]} disagree, and of {counts[UNKNOWN]} nothing can be said"
+    words = f"{counts[AGREES]} agree, {counts[DISAGREES]} disagree, and {counts[UNKNOWN]} are undecided"
 
     assert list(dict.fromkeys(row.sentence for row in rows)) == list(SENTENCES) and len(SENTENCES) == 9
     assert f"{len(rows)} tests of nine sentences of the paper about learning: {words}." in TEXT

@@ -202,7 +202,7 @@ def test_what_is_said_of_ewc_on_new_images_is_what_the_pairs_show(made):
     less = pairs["announced", "oracle"].difference.value
     assert clear["announced", "oracle"] > 0.05
     assert re.search(
-        rf"of the difference at the end, {less:.2f} \[.*\] \(\d+ pairs would do\), 20 pairs cannot say", PAGE
+        rf"Of the difference at the end, {less:.2f} \[.*\] \(\d+ pairs would do\), 20 pairs cannot say", PAGE
     )
     runs = {name: made.on_images(name) for name in ("swoks, fresh", "adwin", "oracle")}
     shares = [
