@@ -209,7 +209,7 @@ def test_what_is_said_of_ewc_on_new_images_is_what_the_pairs_show(made):
         float(value(runs[name], "frames_not_learned")) / float(value(runs[name], "frames"))
         for name in ("swoks, fresh", "adwin")
     ]
-    assert all(0.22 < share < 0.28 for share in shares) and "about a quarter of the frames is not learned" in PAGE
+    assert all(0.22 < share < 0.28 for share in shares) and "About a quarter of the frames is not learned" in PAGE
     found = [made.soon(lines) for lines in runs.values()]
     assert f"SWOKS finds {found[0]} of 60 soon, ADWIN {found[1]}." in PAGE and found[2] == 60
     chance = [1 - exp(-len(made.alarms(runs[name])) / (20 * 819_200) * 65_536) for name in ("swoks, fresh", "adwin")]
