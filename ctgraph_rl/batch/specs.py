@@ -70,7 +70,7 @@ def observation_spec(
         keys["outcome"] = Bounded(OUTCOME_RUNNING, OUTCOME_GOAL, shape=column, dtype=torch.uint8, device="cpu")
         keys["leaf"] = number.clone()
     if num_task_ids:
-        keys["task_id"] = Bounded(0, 1, shape=(*batch_size, num_task_ids), dtype=torch.uint8, device="cpu")
+        keys["task_id"] = Binary(num_task_ids, shape=(*batch_size, num_task_ids), dtype=torch.uint8, device="cpu")
         keys[TASK_NUMBER] = Bounded(-1, num_task_ids - 1, shape=column, dtype=torch.int64, device="cpu")
     return Composite(keys, shape=batch_size, device="cpu")
 
