@@ -17,7 +17,7 @@ PAIRS = [f"{name} {agent}" for name in names_in("plasticity") if name != "none" 
 
 
 class TestEveryPlasticity(PlasticityContract):
-    @pytest.fixture(autouse=True, params=others_slow(PAIRS, "continual_backprop dqn"))
+    @pytest.fixture(autouse=True, params=others_slow(PAIRS, "continual_backprop a2c"))
     def _plasticity(self, request, compose):
         name, agent = request.param.split()
         self.make_agent = made(compose, "agent", agent, *TINY, *less(agent))

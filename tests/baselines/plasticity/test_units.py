@@ -54,7 +54,7 @@ def test_every_cell_is_tried():
     assert tried >= {f"cell={name}" for name in names_in(conf_dir(), "cell")}
 
 
-@pytest.mark.parametrize("kind", others_slow(NETWORKS, "cnn", "frames"))
+@pytest.mark.parametrize("kind", others_slow(NETWORKS, "cnn"))
 def test_a_unit_is_read_by_the_readers_columns_and_nothing_else(compose, kind):
     agent, minibatch = made(compose, kind)
     layers = hidden_layers(agent.policy)
