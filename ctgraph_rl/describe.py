@@ -67,7 +67,7 @@ CHANGING_GOALS = (
 NOISE_AS_DICE = (
     "Noise and rotation on read may serve a deterministic policy as dice, up to the ceiling of stochastic ones."
 )
-NEEDS_MEMORY = "Memory is needed: a deterministic agent without it, as in greedy evaluation, reaches at most, in"
+NEEDS_MEMORY = "Memory is needed: a deterministic agent without it, as in greedy evaluation, reaches at most"
 MOST_LOST = 4
 """Most tasks in a note."""
 
@@ -255,7 +255,7 @@ def _ceilings(curriculum: Curriculum) -> Sheet:
         if alike and None not in (memoryless, optimal) and memoryless == optimal:
             easy.append(label)
         if memoryless is not None and optimal is not None and memoryless < optimal - 1e-9:
-            lost.append(f"{label} {_number(memoryless)} of {_number(optimal)}")
+            lost.append(f"{_number(memoryless)} of {_number(optimal)} in {label}")
     no_memory = f"No memory is needed for {', '.join(easy)}: a deterministic policy without memory is optimal, "
     easily = [f"{no_memory}{SAME_DECISIONS}"] if easy else []
     needed = [f"{NEEDS_MEMORY} {listed(lost, MOST_LOST)}."] if lost else []

@@ -147,7 +147,7 @@ def test_what_an_agent_without_memory_loses_is_said_of_each_task_that_needs_it()
         ceilings = describe(curricula.load(name))[3]
         return [note for note in ceilings.notes if note.startswith("Memory is needed")]
 
-    assert notes("su_b1_4tasks")[0].endswith("reaches at most, in goal1.2 0 of 1, goal2.1 0 of 1.")
+    assert notes("su_b1_4tasks")[0].endswith("reaches at most 0 of 1 in goal1.2, 0 of 1 in goal2.1.")
     assert notes("fo_b1_4tasks") == []
 
 

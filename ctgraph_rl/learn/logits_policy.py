@@ -57,12 +57,11 @@ class LogitsPolicy:
         """
         name = type(self.module).__name__
         shape = list(data["observation"].shape)
-        wanted = (
-            f"a plain module must map observations, float {shape}, to logits, float [{shape[0]}, {self.num_actions}]"
-        )
         fix = "write one that does, or a function of a TensorDict that sets 'action', or a TensorDictModule"
         like = next(self.module.parameters(), torch.zeros((), dtype=torch.float32, device="cpu"))
         keys = ["observation", "task_id"] if self._takes_ids and "task_id" in data.keys() else ["observation"]  # noqa: SIM118
+        read = [f"{key}, float {list(data[key].shape)}" for key in keys]
+        wanted = f"a plain module must map {' and '.join(read)}, to logits, float [{shape[0]}, {self.num_actions}]"
         try:
             with _evaluation_mode(self.module):
                 logits = self.module(*(data[key].to(like.device, like.dtype) for key in keys))

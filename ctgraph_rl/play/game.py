@@ -107,7 +107,7 @@ class Game:
         self.console.print(Text(words), soft_wrap=True)
 
     def _keys(self) -> str:
-        return f"0..{self.graph.branching_factor} act, r restarts, ? tells the truth, q quits"
+        return f"0..{self.graph.branching_factor} act, r restarts, ? shows the tree, q quits"
 
     def score(self) -> str:
         """Return how often the goal was reached, and how often random actions reach it."""
