@@ -199,6 +199,7 @@ class MOHQA(QLearner):
     """A Q-network with a modulated Hebbian network beside it."""
 
     Settings = MOHQASettings
+    needs_episodes = True
     solves = "fully observable tasks (CT-FO); its traces reach over waits that look alike"
 
     policy: ModulatedGreedy

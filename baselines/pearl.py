@@ -181,6 +181,7 @@ class PEARL(Learner):
     Settings = PEARLSettings
     memory = True
     adapt_episodes = 1
+    needs_episodes = True
     output_keys = ("log_probs",)
     solves = "tasks whose goal is drawn from several: it draws a guess of its task before each episode"
 

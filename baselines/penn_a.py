@@ -333,6 +333,7 @@ class PennA(TensorDictModuleBase):
 
     Settings = PennASettings
     memory = True
+    needs_episodes = True
     solves = "tasks whose goal changes within a life, if images show what was paid: it learns without a reward"
     in_keys = ["observation", "is_init", "trial", "life", WEIGHTS, OUTPUTS]  # noqa: RUF012, as TensorDict has it
     out_keys = ["action", *(("next", key) for key in in_keys[2:])]  # noqa: RUF012

@@ -91,11 +91,13 @@ class RL2(PPO):
 
     Settings = RL2Settings
     memory = True
+    needs_episodes = True
     solves = "tasks whose goal changes after a number of episodes: it searches for the goal, then returns to it"
 
     def __init__(self, observation_spec: Composite, action_spec: TensorSpec, **settings: Any) -> None:
         found = "outcome" in observation_spec.keys()  # noqa: SIM118, a Composite is no dict
-        require((found, "RL2 needs CT-graphs, whose episodes say whether they found the goal: take agent=lstm_ppo"))
+        fix = "take agent=lstm_ppo or protocol.episodes=shown"
+        require((found, f"RL2 needs CT-graphs, whose episodes say whether they found the goal: {fix}"))
         super().__init__(observation_spec, action_spec, **settings)
         self.trial_episodes = self.settings.trial_episodes
 

@@ -169,7 +169,9 @@ def protocol_in_words(protocol: Protocol, num_tasks: int) -> str:
         f" A navigating policy acts in the learner's place in a share of the episodes, which falls from 1 to 0 over "
         f"the first {protocol.guide_frames:,} frames."
     )
-    return f"{ids[protocol.task_id]} {boundaries[protocol.boundaries]}" + guide * bool(protocol.guide_frames)
+    endless = " The learner observes no end of an episode." * protocol.hides_episodes
+    said = f"{ids[protocol.task_id]} {boundaries[protocol.boundaries]}{endless}"
+    return said + guide * bool(protocol.guide_frames)
 
 
 def evaluation_in_words(evaluation: Evaluation) -> str:

@@ -15,7 +15,7 @@ from ctgraph_rl.batch.assignment import one_hot_ids, require_num_ids
 from ctgraph_rl.batch.native import Stepped
 from ctgraph_rl.batch.rows import Rows
 from ctgraph_rl.batch.specs import TASK_NUMBER, done_spec, make_specs, reward_spec
-from ctgraph_rl.checks import require, require_all, takes_numbers, true_or_false
+from ctgraph_rl.checks import one_of, require, require_all, takes_numbers, true_or_false
 from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import NO_LEAF, RowState, Shown
@@ -25,6 +25,7 @@ from ctgraph_rl.core.tree import Swap, is_done
 from ctgraph_rl.draw.pixels import render
 from ctgraph_rl.tasks.kinds.gym_task import GymTask
 from ctgraph_rl.tasks.kinds.task_like import ENVIRONMENTS
+from ctgraph_rl.tasks.protocol import EPISODES
 from ctgraph_rl.tasks.switch import Switch
 from ctgraph_rl.tasks.task import Task
 
@@ -68,6 +69,8 @@ class CTGraphEnv(EnvBase):
         kernel: ``"auto"``, ``"off"`` or ``"required"``, as in `Rows`.
         info: False leaves out ``step_count``, ``episode_reward``, ``outcome``, ``leaf`` and ``truncated``, so that
             TorchRL copies less.
+        episodes: ``"hidden"`` hides where episodes end, as `Protocol` says: without ``info``, done flags are False and
+            ``is_init`` is True only after `reset`. ``ends`` has what is hidden of the last step, by key.
 
     Raises:
         ValueError: for no tasks, values out of range, different shapes of observations, and what a required kernel
@@ -98,14 +101,17 @@ class CTGraphEnv(EnvBase):
         num_task_ids: int | None = None,
         kernel: str = "auto",
         info: bool = True,
+        episodes: str = "shown",
     ) -> None:
-        require(*true_or_false(check_actions=check_actions, info=info))
+        require(*true_or_false(check_actions=check_actions, info=info), *one_of(EPISODES, episodes=episodes))
         tasks = require_all(Task, "tasks", tasks)
         self.num_task_ids = require_num_ids(task_ids, num_task_ids)
         device = None if device is None else checked_device(device)
         super().__init__(device=device, batch_size=torch.Size([len(tasks)]))
         self.check_actions = check_actions
-        self.info = info
+        self.hides_episodes = episodes == "hidden"
+        self.info = info and not self.hides_episodes
+        self.ends: RowData = {}
         self.rows = Rows(
             tasks, seed, first_row, task_pool=task_pool, device=self.device, noise_bank=noise_bank, kernel=kernel
         )
@@ -205,6 +211,8 @@ class CTGraphEnv(EnvBase):
             shown = self.rows.reset(mask)
         is_init = self.rows.step_count == 0
         is_init = is_init if mask is None else is_init & mask
+        if self.hides_episodes:
+            return self._tensordict(self._hide(shown) | {"is_init": is_init.unsqueeze(-1)})
         return self._tensordict(self._data(shown.observation, shown.done.unsqueeze(-1), is_init.unsqueeze(-1), shown))
 
     def _read_state(self, tensordict: TensorDictBase | None, mask: Tensor | None) -> RowState:
@@ -238,7 +246,7 @@ class CTGraphEnv(EnvBase):
 
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """The standard method with equal data, without asking whether rows are done and without a merge."""
-        if "_step" in tensordict:
+        if "_step" in tensordict or self.hides_episodes:
             return super()._step_and_maybe_reset(tensordict)
         tensordict = self.step(tensordict.to(self.device) if tensordict.device != self.device else tensordict)
         tensordict_ = self._step_mdp(tensordict)
@@ -294,6 +302,8 @@ class CTGraphEnv(EnvBase):
         Raises:
             ValueError: for actions that ``check_actions`` refuses.
         """
+        if self.hides_episodes:
+            return self._step_or_start(action, mask)
         if self.check_actions:
             self.rows.check_actions(action, mask)
         shown = self.rows.step(action, mask)  # type: ignore[arg-type]
@@ -307,9 +317,30 @@ class CTGraphEnv(EnvBase):
         data["reward"] = reward.unsqueeze(-1)
         return data
 
+    def _step_or_start(self, action: Tensor | None, mask: Tensor | None) -> RowData:
+        """Step all rows but those whose episode has ended, which start another."""
+        require((mask is None, "rows with hidden episodes step together: leave out _step"))
+        over = self.rows.is_done
+        if self.check_actions:
+            self.rows.check_actions(action, ~over)
+        shown = self.rows.step_or_reset(action, over)  # type: ignore[arg-type]
+        return self._hide(shown) | {"reward": self.rows.reward.unsqueeze(-1)}
+
+    def _hide(self, shown: Shown) -> RowData:
+        """Return the rows' data without ends of episodes, which `ends` keeps."""
+        ends = {"done": shown.done, "outcome": shown.outcome, "leaf": shown.leaf}
+        ends |= {"step_count": self.rows.step_count, "episode_reward": self.rows.episode_reward}
+        self.ends = {key: value.unsqueeze(-1) for key, value in ends.items()}
+        never = torch.zeros_like(self.ends["done"])
+        data = {"observation": shown.observation, "is_init": never, "done": never, "terminated": never}
+        return data | self._show_ids() if self.num_task_ids else data
+
     def step_and_restart_data(self, action: Tensor | None) -> tuple[RowData, RowData]:
         """Return `step_data`, and `restart_data` for done rows; on CPUs in one call of the kernel."""
         rows = self.rows
+        if self.hides_episodes:
+            after = self.step_data(action)
+            return after, {key: value for key, value in after.items() if key != "reward"}
         stepped = None
         if rows.uses_kernel and not rows.tasks_change:
             most = rows.max_branching if self.check_actions else -1
@@ -393,7 +424,7 @@ class CTGraphEnv(EnvBase):
         self.rows.set_seed(seed)  # type: ignore[arg-type]
 
 
-_SHARED = ("terminated", "step_count", "episode_reward", "reward", "task_id", TASK_NUMBER)
+_SHARED = ("is_init", "terminated", "step_count", "episode_reward", "reward", "task_id", TASK_NUMBER)
 
 
 def _own(data: RowData) -> RowData:

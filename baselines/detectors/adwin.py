@@ -50,6 +50,7 @@ class ADWIN(Detector):
         ModuleNotFoundError: without River; names the extra to install.
     """
 
+    needs_episodes = True
     reads = "returns"
 
     def __init__(

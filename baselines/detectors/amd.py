@@ -64,6 +64,7 @@ class AMD(Detector):
         num_untested: steps of a new label before it is tested.
     """
 
+    needs_episodes = True
     reads = "one-hot observations"
     needs = ("observation_id",)
     changing = ("label", "is_doubted", "pending", "recent", "last_action")

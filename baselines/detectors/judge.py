@@ -32,6 +32,9 @@ class Judge(TakesNumbers):
     needs: ClassVar[tuple[str, ...]] = ()
     """Optional fields of `Seen` that it reads: ``features``, ``observation_id``."""
 
+    needs_episodes: ClassVar[bool] = False
+    """Whether it reads where episodes end, and their returns."""
+
     is_oracle: ClassVar[bool] = False
     """Whether it is given the curriculum."""
 

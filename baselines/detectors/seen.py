@@ -18,7 +18,9 @@ class Seen(NamedTuple):
     reward: Tensor  # float32 [rows, steps]
     is_init: Tensor  # bool [rows, steps]: an episode begins with the step's observation
     done: Tensor  # bool [rows, steps]: the episode ends with the step
-    episode_return: Tensor  # float32 [rows, steps]: return of the episode so far; of the whole one where it is done
+    episode_return: (
+        Tensor  # float32 [rows, steps]: return of the episode so far; of the whole one where it is done; NaN if hidden
+    )
     features: Tensor | None = None  # float32 [rows, steps, F] at the step's observation, by the weights that acted
     observation_id: Tensor | None = None  # int64 [rows, steps]: number of the one-hot observation
     next_observation_id: Tensor | None = None  # int64 [rows, steps]: of the observation after the action

@@ -45,6 +45,8 @@ class MaskAMSC(SelectedMasks):
         settings: arguments of `SelectedMasks`.
     """
 
+    needs_episodes = True
+
     def __init__(
         self,
         distance: str,

@@ -38,6 +38,9 @@ class Method(TakesNumbers, Hooks):
     needs_boundaries: bool = True
     """Whether task changes must be announced."""
 
+    needs_episodes: bool = False
+    """Whether it needs data that say where episodes end."""
+
     reads_tasks: str = ""
     """What it reads of tasks beside ids, for the message that refuses a detector's labels."""
 
@@ -75,6 +78,10 @@ class Method(TakesNumbers, Hooks):
             (
                 not self.needs_boundaries or protocol.announces,
                 f"{name} needs announced task changes: set protocol.boundaries=announced{or_detector}",
+            ),
+            (
+                not (self.needs_episodes and protocol.hides_episodes),
+                f"{name} needs the ends of episodes, which are hidden: set protocol.episodes=shown",
             ),
             (
                 not (self.needs_task_id and several),

@@ -306,6 +306,7 @@ class InnerLoop(Learner):
     settings: Any
     memory = True
     needs_whole_trials = True
+    needs_episodes = True
     output_keys = ("log_probs",)
     minibatch_size = 0  # batches differ in their number of trials
 

@@ -42,6 +42,9 @@ class Learner(TakesNumbers, Trained):
     """Whether `loss` and `outputs` can be vectorised over seeds, see `baselines.update.seeds`; with ``memory``, whether
     seeds can take turns. A subclass that overrides what seeds share, such as `learn`, must set it again."""
 
+    needs_episodes: ClassVar[bool] = False
+    """Whether it needs data that say where episodes end."""
+
     solves: ClassVar[str]
     """Which tasks it can solve in principle, in a few words."""
 

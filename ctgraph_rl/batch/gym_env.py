@@ -18,12 +18,13 @@ from typing_extensions import override
 from ctgraph_rl.batch.assignment import one_hot_ids, require_num_ids
 from ctgraph_rl.batch.rows import seed_rule
 from ctgraph_rl.batch.specs import TASK_NUMBER, done_spec, observation_spec, reward_spec
-from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule, require, require_all, takes_numbers
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule, one_of, require, require_all, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import beside
-from ctgraph_rl.tasks.kinds.gym_spaces import ActionForm
+from ctgraph_rl.tasks.kinds.gym_spaces import ActionForm, Taken
 from ctgraph_rl.tasks.kinds.gym_task import GymTask, make_forms, registered
 from ctgraph_rl.tasks.kinds.task_like import close_env
+from ctgraph_rl.tasks.protocol import EPISODES
 
 T = TypeVar("T")
 
@@ -44,6 +45,7 @@ class GymEnv(EnvBase):
         task_pool: the tasks that `set_tasks` may be given. Default: ``tasks``.
         task_ids: the id of each task, as in `TaskLike.make_env`.
         num_task_ids: length of ``task_id``; None: just enough.
+        episodes: ``"hidden"`` hides where they end, as `ctgraph_rl.CTGraphEnv` does.
 
     Raises:
         ValueError: for tasks of different spaces, and an environment that does not repeat with its seed or leaves its
@@ -68,7 +70,9 @@ class GymEnv(EnvBase):
         device: torch.device | str = "cpu",
         task_ids: Mapping[GymTask, int] | None = None,
         num_task_ids: int | None = None,
+        episodes: str = "shown",
     ) -> None:
+        require(*one_of(EPISODES, episodes=episodes))
         tasks = require_all(GymTask, "tasks", tasks)
         pool = tasks if task_pool is None else require_all(GymTask, "task_pool", task_pool)
         self.pool = tuple(dict.fromkeys((*pool, *tasks)))
@@ -79,6 +83,8 @@ class GymEnv(EnvBase):
         count = len(tasks)
         super().__init__(device=checked_device(device), batch_size=torch.Size([count]))
         self.seed = seed
+        self.hides_episodes = episodes == "hidden"
+        self.ends: dict[str, Tensor] = {}
         self.tasks = tasks
         self._ids = {} if task_ids is None else dict(task_ids)
         self._next = tasks
@@ -100,11 +106,13 @@ class GymEnv(EnvBase):
         seen: TensorSpec = Unbounded(shape=shape, dtype=torch.float32, device="cpu")
         if observed.dtype == np.uint8:
             seen = Bounded(0, observed.largest, shape=shape, dtype=torch.uint8, device="cpu")
-        self.observation_spec = observation_spec(seen, rows, self.num_task_ids).to(self.device)
+        shown = not self.hides_episodes
+        self.observation_spec = observation_spec(seen, rows, self.num_task_ids, info=shown).to(self.device)
         self.action_spec = _make_action_spec(acted, rows).to(self.device)
         self.reward_spec = reward_spec(rows).to(self.device)
         self.full_done_spec = done_spec(rows).to(self.device)
-        self._data = {**self.observation_spec.zero(), **self.full_done_spec.zero()}
+        every = observation_spec(seen, rows, self.num_task_ids).to(self.device)
+        self._data = {**every.zero(), **self.full_done_spec.zero()}
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close the environments of all rows; one that fails is named and keeps no other open."""
@@ -151,12 +159,9 @@ class GymEnv(EnvBase):
         if given is not None and (self._episode >= 0).all():
             mask = given.view(-1).cpu().numpy()
         rows = np.flatnonzero(mask).tolist()
-        self._place(rows)
-        self._episode[mask] += 1
         seen = self._zero_observations()
         for row in rows:
-            self._actions[row] = []
-            seen[row] = self._begin(row)
+            seen[row] = self._begin_next(row)
         begun = torch.from_numpy(mask).to(self.device).unsqueeze(-1)
         data = self._observed(seen)
         for key, value in self._data.items():
@@ -164,6 +169,12 @@ class GymEnv(EnvBase):
             data[key] = torch.where(beside(begun, value), first, value)
         data["is_init"] = begun
         return self._shown(data)
+
+    def _begin_next(self, row: int) -> NDArray[Any]:
+        self._place([row])
+        self._episode[row] += 1
+        self._actions[row] = []
+        return self._begin(row)
 
     def _begin(self, row: int) -> NDArray[Any]:
         observed, _ = self._forms[self.tasks[row]]
@@ -177,10 +188,14 @@ class GymEnv(EnvBase):
         rewards = []
         terminated = []
         truncated = []
-        for row, env in enumerate(self._envs):
+        starts = self._data["done"] & self.hides_episodes
+        for row, begins in enumerate(starts.flatten().tolist()):
             observed, acted = self._forms[self.tasks[row]]
-            self._actions[row].append(actions[row])
-            taken = self._read(row, observed.read_step, env.step(acted.give(actions[row])))
+            if begins:
+                taken = Taken(self._begin_next(row), 0.0, False, False)
+            else:
+                self._actions[row].append(actions[row])
+                taken = self._read(row, observed.read_step, self._envs[row].step(acted.give(actions[row])))
             seen[row] = taken.observation
             rewards.append(taken.reward)
             terminated.append(taken.terminated)
@@ -192,8 +207,8 @@ class GymEnv(EnvBase):
         data["truncated"] = self._column(truncated, torch.bool)
         data["done"] = data["terminated"] | data["truncated"]
         data["is_init"] = torch.zeros_like(data["done"])
-        data["step_count"] = self._data["step_count"] + 1
-        data["episode_reward"] = self._data["episode_reward"] + reward
+        data["step_count"] = (self._data["step_count"] + 1) * ~starts
+        data["episode_reward"] = torch.where(starts, 0, self._data["episode_reward"]) + reward
         return self._shown(data).set("reward", reward)
 
     def _read(self, row: int, read: Callable[[Any], T], returned: Any) -> T:
@@ -213,6 +228,11 @@ class GymEnv(EnvBase):
 
     def _shown(self, data: dict[str, Tensor]) -> TensorDict:
         self._data = data
+        if self.hides_episodes:
+            self.ends = {key: data[key] for key in ("done", "step_count", "episode_reward")}
+            never = torch.zeros_like(data["done"])
+            data = {key: value for key, value in data.items() if key not in self.ends}
+            data |= dict.fromkeys(("done", "terminated", "truncated"), never)
         return TensorDict(data, batch_size=self.batch_size, device=self.device).clone()
 
     def _observed(self, seen: NDArray[Any]) -> dict[str, Tensor]:

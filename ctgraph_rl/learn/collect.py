@@ -20,7 +20,7 @@ from ctgraph_rl.core.region import Region
 from ctgraph_rl.core.row_params import RowParams
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.tasks.curriculum import Curriculum
-from ctgraph_rl.tasks.kinds.task_like import TaskLike, close_env
+from ctgraph_rl.tasks.kinds.task_like import ENVIRONMENTS, TaskLike, close_env
 from ctgraph_rl.tasks.task import are_graphs
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
@@ -36,6 +36,9 @@ TRIAL = "trial"
 
 PREVIOUS_ACTION = "previous_action"
 """Key of the last action in a recurrent state, int64 [rows]."""
+
+ENDS = "ends"
+"""Key under ``next`` of what hidden episodes hide of their ends; no learner gets it."""
 
 UNSTORED = "unstored_"
 """Prefix of recurrent states that a batch does not store for each step: every step shows the value before the first
@@ -60,8 +63,14 @@ def make_env(
     pool, length = _pool_and_ids(curriculum)
     task_ids = curriculum.task_ids if length else None
     kind = type(curriculum.examples[0])
-    env = kind.make_env(tasks, seed, task_pool=pool, device=device, task_ids=task_ids, num_task_ids=length or None)
-    if not isinstance(env, CTGraphEnv):
+    how = curriculum.protocol
+    hides = {"episodes": how.episodes} if how.hides_episodes else {}
+    known = f"protocol.episodes=hidden needs CT-graphs or environments of Gymnasium, not {kind.__name__}"
+    require((not hides or issubclass(kind, tuple(ENVIRONMENTS)), f"{known}: set it to shown"))
+    env = kind.make_env(
+        tasks, seed, task_pool=pool, device=device, task_ids=task_ids, num_task_ids=length or None, **hides
+    )
+    if not isinstance(env, CTGraphEnv) and not hides:
         try:
             require(*_env_rules(env, kind.__name__, len(tasks), length))
         except ValueError:
@@ -91,7 +100,8 @@ def agent_specs(curriculum: Curriculum) -> Specs:
     """
     pool, length = _pool_and_ids(curriculum)
     if are_graphs(curriculum.examples):
-        return make_specs((*curriculum.examples, *curriculum.evaluation.held_out), num_task_ids=length)
+        examples = (*curriculum.examples, *curriculum.evaluation.held_out)
+        return make_specs(examples, num_task_ids=length, info=not curriculum.protocol.hides_episodes)
     env = make_env(curriculum, pool[:1], 0)
     try:
         return Specs(env.observation_spec_unbatched, env.action_spec_unbatched)
@@ -197,7 +207,8 @@ def _acts_on_tensors(policy: Policy) -> bool:
 
 def _is_captured(env: EnvBase, policy: Policy) -> bool:
     """Return whether steps run as a CUDA graph: those of a ``capturable`` policy."""
-    return type(env) is CTGraphEnv and getattr(policy, "capturable", False) and captures(env.device)
+    is_known = type(env) is CTGraphEnv and not env.hides_episodes
+    return is_known and getattr(policy, "capturable", False) and captures(env.device)
 
 
 class CapturedAct:
@@ -265,12 +276,23 @@ def take_step(env: EnvBase, data: Step) -> tuple[Step, Step]:
     """
     if type(env) is not CTGraphEnv:
         taken, following = env.step_and_maybe_reset(TensorDict(data, env.batch_size, device=env.device))
-        return dict(taken.items(True, True)), dict(following.items(True, True))
+        return with_ends(dict(taken.items(True, True)), env), dict(following.items(True, True))
     step = dict(data)
     after, restarted = env.step_and_restart_data(step.get("action"))
     step |= {("next", key): value for key, value in after.items()}
     kept = {key: value for key, value in step.items() if key[0] != "next" and key != "reward"}
-    return step, kept | restarted
+    return with_ends(step, env), kept | restarted
+
+
+def with_ends(step: Step, env: EnvBase) -> Step:
+    """Return a step with what hidden episodes hide of it."""
+    ends = getattr(env, "ends", {})
+    return step | {("next", ENDS, key): value for key, value in ends.items()} if ends else step
+
+
+def without_ends(batch: TensorDictBase) -> TensorDictBase:
+    """Return what a learner gets of a batch."""
+    return batch.exclude(("next", ENDS)) if ENDS in batch["next"].keys() else batch  # noqa: SIM118, no dict
 
 
 def _append(steps: list[Step], step: Step, unstored: Sequence[str]) -> None:

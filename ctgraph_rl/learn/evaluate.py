@@ -20,7 +20,7 @@ from ctgraph_rl.checks import NamedValues, require, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL
 from ctgraph_rl.env import CTGraphEnv
-from ctgraph_rl.learn.collect import InitialState, Policy, act, agent_specs, make_env, make_start
+from ctgraph_rl.learn.collect import ENDS, InitialState, Policy, act, agent_specs, make_env, make_start
 from ctgraph_rl.learn.exact import exact_measures, shown_id
 from ctgraph_rl.learn.labels import task_labels
 from ctgraph_rl.learn.logits_policy import as_policy
@@ -120,14 +120,17 @@ def _first_episodes(env: EnvBase, policy: Policy, initial_state: InitialState | 
     start = make_start(env, initial_state)
     first = env.reset().update(start)
     data = dict(first.items(True, True))
+    hidden = getattr(env, "ends", {})
+    after = ("next", ENDS) if hidden else ("next",)
+    first = TensorDict(hidden, env.batch_size) if hidden else first
     result = first.select("episode_reward", "step_count", "outcome", "leaf", strict=False)
     result = result.unsqueeze(-1).expand(env.numel(), num_episodes).clone()
     played = torch.zeros(env.batch_size, dtype=torch.int64, device=env.device)
     while (played < num_episodes).any():
         step, data = act(env, policy, data, start)
-        ends = (step["next", "done"].squeeze(-1) & (played < num_episodes)).nonzero().squeeze(-1)
+        ends = (step[*after, "done"].squeeze(-1) & (played < num_episodes)).nonzero().squeeze(-1)
         for key, value in result.items():
-            value[ends, played[ends]] = step["next", key][ends]
+            value[ends, played[ends]] = step[*after, key][ends]
         played[ends] += 1
     return result
 

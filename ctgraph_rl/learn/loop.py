@@ -19,9 +19,17 @@ from torchrl.envs import EnvBase
 
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues
-from ctgraph_rl.learn.collect import Policy, make_env
+from ctgraph_rl.learn.collect import Policy, make_env, without_ends
 from ctgraph_rl.learn.evaluate import Evaluator
-from ctgraph_rl.learn.refusals import check_adaptation, check_env, check_exact, check_ids, check_rows, resumes
+from ctgraph_rl.learn.refusals import (
+    check_adaptation,
+    check_env,
+    check_episodes,
+    check_exact,
+    check_ids,
+    check_rows,
+    resumes,
+)
 from ctgraph_rl.learn.segments import Segment, announced_id, collect_segment, guided, log_training, segments
 from ctgraph_rl.learn.unit_metrics import UnitMeter, norms, weights_of
 from ctgraph_rl.log.run_log import RunLog
@@ -184,6 +192,7 @@ class Lockstep:
     ) -> None:
         check_rows(curriculum, group.agents[0].num_envs)
         check_ids(curriculum, group.agents[0])
+        check_episodes(curriculum, group.agents[0])
         check_adaptation(curriculum, group.agents[0])
         check_exact(curriculum, group.agents[0])
         self.curriculum = curriculum
@@ -265,6 +274,8 @@ class Lockstep:
                     self.group.start_task(announced_id(self.curriculum, segment.blocks[0]))
                 self._measure_units(self.curriculum.block_at(segment.start + 1), "start")
             restore = None if saved is None else partial(self._restore, saved)
+            if self.frames == segment.start > 0 and self.curriculum.protocol.hides_episodes:
+                restore = self._start_unnoticed
             batches = collect_segment(
                 segment,
                 self.env,
@@ -288,6 +299,12 @@ class Lockstep:
             self._end_segment(segment)
             if self.frames >= self.last_frames:
                 return
+
+    def _start_unnoticed(self) -> TensorDictBase:
+        """Start the next block's episodes as if nothing had ended; return the data of the next step."""
+        assert self._carried is not None
+        data = self._carried.clone().update(self.env.reset())
+        return data.set("is_init", torch.zeros_like(data["is_init"]))
 
     def _policy(self, segment: Segment, saved: Sequence[SavedState] | None) -> Policy:
         """Return what acts in a segment: of an agent that was frozen before it, the policy for the announced task."""
@@ -321,13 +338,13 @@ class Lockstep:
     def _learn(self, batch: TensorDictBase, segment: Segment) -> None:
         start = self.frames
         self.frames += batch.numel() // len(self.logs)
-        self.batch = batch
+        self.batch = without_ends(batch)
         self.returns = []
         share = guided(start - segment.start, self.curriculum)
         parts = [batch] if len(self.logs) == 1 else batch.chunk(len(self.logs))
         before = [weights_of(meter.agent) for meter in self.meters]
         is_frozen = self.frames > self.last_learned
-        learnt: Sequence[Learnt] = [{} for _ in self.logs] if is_frozen else self.group.learn(batch)
+        learnt: Sequence[Learnt] = [{} for _ in self.logs] if is_frozen else self.group.learn(self.batch)
         for number, measured in enumerate(learnt):
             if number in self.failed:
                 continue
@@ -374,7 +391,8 @@ class Lockstep:
             self.env.load_state_dict(_join([state["env"] for state in saved]))
         rows = [self.env.numel() // len(saved)]
         data = [TensorDict(state["carried"], rows, device=self.env.device) for state in saved]
-        return data[0] if len(data) == 1 else torch.cat(data)
+        self._carried = data[0] if len(data) == 1 else torch.cat(data)
+        return self._carried
 
     def _restore_agents(self, saved: Sequence[SavedState]) -> None:
         with saved_state_fits():

@@ -65,6 +65,18 @@ def check_ids(curriculum: Curriculum, agent: Agent) -> None:
     require((shows or not reads, f"{message}; give it a curriculum with protocol.task_id=one_hot, or make a new agent"))
 
 
+def check_episodes(curriculum: Curriculum, agent: Agent) -> None:
+    """Refuse an agent with ``needs_episodes`` where the curriculum hides their ends.
+
+    Raises:
+        ValueError: names the agent.
+    """
+    learner = getattr(agent, "unwrapped", agent)
+    hides = curriculum.protocol.hides_episodes
+    needs = f"{type(learner).__name__} needs the ends of episodes, which are hidden: set protocol.episodes=shown"
+    require((not hides or not getattr(learner, "needs_episodes", False), needs))
+
+
 def check_exact(curriculum: Curriculum, agent: Agent) -> None:
     """Refuse exact evaluation of an agent, or on a task, that has no exact measures.
 

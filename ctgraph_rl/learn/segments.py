@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.learn.collect import Policy, batches
+from ctgraph_rl.learn.collect import ENDS, Policy, batches
 from ctgraph_rl.learn.evaluate import EPISODE_KEYS, episode_means
 from ctgraph_rl.learn.guide import Guide, guided_share
 from ctgraph_rl.log.run_log import RunLog
@@ -140,7 +140,7 @@ def log_training(
     end = start + batch.numel()
     for part in _split_at_ends(batch, start, curriculum.ends):
         frames += part.numel()
-        after = part["next"]
+        after = part["next"].get(ENDS, part["next"])
         episodes = episode_means(after.select(*EPISODE_KEYS, strict=False)[after["done"].squeeze(-1)])
         measured = episodes | dict(measurements)
         if frames != end:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from ctgraph_rl.env import CTGraphEnv
@@ -34,7 +37,10 @@ class Player:
     ) -> None:
         self.task = task
         self.seed = seed
-        self.env = CTGraphEnv([task], seed) if curriculum is None else make_env(curriculum, [task], seed)
+        self.env: EnvBase = CTGraphEnv([task], seed)
+        if curriculum is not None:
+            shown = replace(curriculum, protocol=replace(curriculum.protocol, episodes="shown"))
+            self.env = make_env(shown, [task], seed)
         self.policy = policy(self.env) if isinstance(policy, type) else policy
         self.memory = TensorDict(batch_size=[1]) if initial_state is None else initial_state(1)
         self.exploration = ExplorationType.DETERMINISTIC if greedy else ExplorationType.RANDOM

@@ -79,9 +79,11 @@ def expert_curriculum(curriculum: Curriculum, task: TaskLike) -> Curriculum:
     if how.task_id != "hidden":
         length = how.length(len(curriculum.tasks)) if how.task_id == "one_hot" else None
         ids = (curriculum.task_ids[task],)
-        how = Protocol(how.task_id, num_task_ids=length, task_ids=ids, guide_frames=how.guide_frames)
+        how = Protocol(
+            how.task_id, num_task_ids=length, task_ids=ids, guide_frames=how.guide_frames, episodes=how.episodes
+        )
     else:
-        how = Protocol(guide_frames=how.guide_frames)
+        how = Protocol(guide_frames=how.guide_frames, episodes=how.episodes)
     evaluation = replace(curriculum.evaluation, tasks="all", held_out=())
     blocks = (Block((task,), block.num_frames),)
     return Curriculum(EXPERT, 1, "-", blocks, evaluation=evaluation, protocol=how)

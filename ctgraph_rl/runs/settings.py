@@ -39,6 +39,7 @@ ADDED: dict[str, NamedValues] = {
         "portable": False,
         "save_optimiser": True,
         "protocol.guide_frames": None,
+        "protocol.episodes": None,
         "evaluation.adapt_episodes": None,
         "evaluation.exact": None,
         "objective_until": None,

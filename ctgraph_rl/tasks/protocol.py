@@ -25,6 +25,7 @@ ProtocolPart = TypeVar("ProtocolPart", "Evaluation", "Protocol")
 
 TASK_IDS = ("hidden", "one_hot", "at_boundaries")
 BOUNDARIES = ("announced", "hidden")
+EPISODES = ("shown", "hidden")
 EVALUATED = ("all", "seen")
 MOST_IDS = 2**20
 """One-hot ids are held for every row."""
@@ -199,9 +200,12 @@ class Protocol:
         guide_frames: frames after each announced boundary over which a guide's share of new episodes falls from 1 to 0.
             The guide waits where it must and decides at random, so that the learner sees rewards early. 0: only the
             learner acts.
+        episodes: ``shown``; ``hidden``: the learner observes no end of an episode. Done flags stay False, ``is_init``
+            is True once in a life, and recurrent state is kept, also over announced boundaries. The last state of an
+            episode takes one more action, which has no effect and reward 0; then the next episode starts.
 
     Raises:
-        ValueError: for values out of range, and ids given at boundaries that are hidden.
+        ValueError: for values out of range, ids given at boundaries that are hidden, and a guide of hidden episodes.
     """
 
     task_id: str = "hidden"
@@ -209,10 +213,15 @@ class Protocol:
     num_task_ids: int | None = None
     task_ids: tuple[int, ...] | None = None
     guide_frames: int = field(default=0, metadata={"added": True})
+    episodes: str = field(default="shown", metadata={"added": True})
 
     def __post_init__(self) -> None:
         make_fields_plain(self)
-        require(*one_of(TASK_IDS, task_id=self.task_id), *one_of(BOUNDARIES, boundaries=self.boundaries))
+        require(
+            *one_of(TASK_IDS, task_id=self.task_id),
+            *one_of(BOUNDARIES, boundaries=self.boundaries),
+            *one_of(EPISODES, episodes=self.episodes),
+        )
         ids = self.task_ids
         is_ids = ids is None or (are_ints(ids, 0, MOST_IDS) and bool(ids))
         names_ids = self.task_id != "hidden" or (ids is None and self.num_task_ids is None)
@@ -221,6 +230,10 @@ class Protocol:
         is_length = self.num_task_ids is None or is_int(self.num_task_ids, 1, MOST_IDS)
         require(
             (is_int(self.guide_frames, 0), f"guide_frames must be an integer >= 0, got {self.guide_frames!r}"),
+            (
+                not (self.hides_episodes and self.guide_frames),
+                f"guide_frames={self.guide_frames} guides whole episodes, which episodes=hidden hides: set it to 0",
+            ),
             (is_length, f"num_task_ids must be an integer in 1..{MOST_IDS}, got {self.num_task_ids!r}"),
             (is_ids, f"task_ids must be integers in 0..{MOST_IDS}, one for each task, got {ids!r}"),
             (differ, f"task_ids must differ from each other, got {ids!r}"),
@@ -232,6 +245,11 @@ class Protocol:
     def announces(self) -> bool:
         """Whether the agent is notified of boundaries."""
         return self.boundaries == "announced"
+
+    @property
+    def hides_episodes(self) -> bool:
+        """Whether the learner observes no end of an episode."""
+        return self.episodes == "hidden"
 
     def ids(self, num_tasks: int) -> tuple[int, ...]:
         """The id of each of ``num_tasks`` tasks.

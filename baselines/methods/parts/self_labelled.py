@@ -72,6 +72,10 @@ class SelfLabelled:
                 not reads,
                 f"{method} needs {reads}, which no detector gives: take another method, or leave the detector out",
             ),
+            (
+                not (self.detector.needs_episodes and how.hides_episodes),
+                f"{detector} needs the ends of episodes, which are hidden: set protocol.episodes=shown",
+            ),
             (wants <= room, f"max_labels={room} is too few for {wants} tasks: set detector.max_labels=null"),
         )
         labelled = as_labelled(curriculum)
@@ -122,7 +126,7 @@ class SelfLabelled:
 def as_labelled(curriculum: Curriculum) -> Curriculum:
     """Return the curriculum with each task in a block, announced with its id."""
     blocks = tuple(Block((task,), curriculum.num_frames) for task in curriculum.tasks)
-    return replace(curriculum, blocks=blocks, protocol=Protocol("at_boundaries", "announced"))
+    return replace(curriculum, blocks=blocks, protocol=Protocol("at_boundaries", episodes=curriculum.protocol.episodes))
 
 
 class SelfLabelledAgent(nn.Module):
@@ -235,7 +239,7 @@ class SelfLabelledAgent(nn.Module):
             "action": batch["action"],
             "is_init": batch["is_init"].squeeze(-1),
             **{key: after[key].squeeze(-1) for key in ("reward", "done")},
-            "episode_return": after["episode_reward"].squeeze(-1),
+            "episode_return": after.get("episode_reward", torch.full_like(after["reward"], torch.nan)).squeeze(-1),
         }
         if "features" in needs:
             trunk: Any = self._trunk
