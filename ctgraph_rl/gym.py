@@ -53,6 +53,8 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
         num_task_ids: length of ``task_id``; None: just enough.
         render_mode: ``rgb_array``, ``ansi`` or None.
         kernel: ``"auto"``, ``"off"`` or ``"required"``, as in `Rows`.
+        life: steps of a life, which is ``truncated`` then and hides where its episodes end: the last state of one takes
+            one more action, without effect, and the next starts. Only ``info`` says so. None: an episode at a time.
 
     Raises:
         ValueError: for values out of range.
@@ -71,8 +73,10 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
         num_task_ids: int | None = None,
         render_mode: str | None = None,
         kernel: str = "auto",
+        life: int | None = None,
         **changes: Any,
     ) -> None:
+        require(_life_rule(life))
         num_threads = torch.get_num_threads()
         torch.set_num_threads(1)  # `AsyncVectorEnv` forks the process, and a fork with threads waits for ever
         try:
@@ -88,9 +92,11 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
         self._num_actions = self.rows.max_branching + 1
         self._is_seeded = False
         self._is_over = True
+        self._life = life
+        self._age = 0
 
     def set_task(self, task: Task) -> None:
-        """Change to a task of the pool at the next reset."""
+        """Change to a task of the pool at the next reset, or the next episode of a life."""
         (self._next_number,) = find_numbers(self.task_pool, [task])
 
     @torch.inference_mode()
@@ -104,9 +110,8 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
         """
         require(_seed_rule(seed))
         super().reset(seed=seed)
-        if self._next_number != self._number:
-            self._number = self._next_number
-            self.rows.set_tasks([self.task_pool[self._number]])
+        self._change_task()
+        self._age = 0
         if seed is not None or not self._is_seeded:
             self._is_seeded = True
             first = int(self.np_random.integers(2**63 - 1)) if seed is None else seed
@@ -129,6 +134,8 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
                 (is_action, f"action must be an integer in 0..{self._num_actions - 1}, got {action!r}"),
                 (not self._is_over, "no episode is running: reset first"),
             )
+        if self._life is not None:
+            return self._live_on(_as_tensor(number))
         observation, done = self.rows.act(_as_tensor(number))
         self._is_over = bool(done.item())
         outcome = OUTCOME_RUNNING
@@ -138,6 +145,22 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
         shown = add_id(observation.numpy()[0], self._ids, self._number)
         info = {"task": self._number, "outcome": outcome, "leaf": leaf}
         return shown, self.rows.reward.item(), self._is_over, False, info
+
+    def _change_task(self) -> None:
+        if self._next_number != self._number:
+            self._number = self._next_number
+            self.rows.set_tasks([self.task_pool[self._number]])
+
+    def _live_on(self, action: Tensor) -> tuple[Any, float, bool, bool, NamedValues]:
+        ended = self.rows.is_done
+        if ended.item():
+            self._change_task()
+        seen = self.rows.step_or_reset(action, ended)
+        self._age += 1
+        self._is_over = self._age == self._life
+        info = {"task": self._number, "outcome": int(seen.outcome.item()), "leaf": int(seen.leaf.item())}
+        shown = add_id(seen.observation.numpy()[0], self._ids, self._number)
+        return shown, self.rows.reward.item(), False, self._is_over, info
 
     def render(self) -> Frame | None:
         """The state as a picture, uint8 [192, 384, 3], or text."""
@@ -158,6 +181,7 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         autoreset_mode: when a row starts its next episode: ``NextStep``, in the next step, which ignores its action;
             ``SameStep``, at once, the last in ``final_obs`` and ``final_info``; ``Disabled``, by `reset` of a mask.
         kernel: ``"auto"``, ``"off"`` or ``"required"``, as in `Rows`.
+        life: as in `CTGraphGymEnv`; a row that is truncated starts its next life as it would an episode.
 
     Raises:
         ValueError: for values out of range.
@@ -178,12 +202,13 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         kernel: str = "auto",
+        life: int | None = None,
         **changes: Any,
     ) -> None:
         within = f"num_envs must be an integer in 1..{MOST_ROWS}, got {num_envs!r:.80}"
         limit = changes.get("max_episode_steps")
         whole = f'this batch truncates no episode, got max_episode_steps={limit!r:.80}; vectorization_mode="sync" does'
-        require((is_int(num_envs, 1, MOST_ROWS), within), ("max_episode_steps" not in changes, whole))
+        require((is_int(num_envs, 1, MOST_ROWS), within), ("max_episode_steps" not in changes, whole), _life_rule(life))
         rows = as_tuple(task)
         given = rows if isinstance(rows, tuple) else (task,)
         require((len(given) in (1, num_envs), f"task must be one, or one per row of {num_envs}, got {len(given)}"))
@@ -206,6 +231,8 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         self._seeds = np.zeros(num_envs, np.int64)
         self._is_seeded = False
         self._is_over = np.ones(num_envs, np.bool_)
+        self._life = life
+        self._age = np.zeros(num_envs, np.int64)
 
     def set_tasks(self, tasks: Iterable[Task]) -> None:
         """Give every row a task of the pool, from its next reset."""
@@ -237,6 +264,7 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         self._start_streams(mask, seed)
         self._change_tasks(mask)
         self._is_over = self._is_over & ~mask
+        self._age[mask] = 0
         shown = self.rows.reset(torch.from_numpy(mask))
         return add_id(shown.observation.numpy(), self._ids, self._numbers), self._infos(shown, mask)
 
@@ -248,7 +276,7 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
             ValueError: for other actions, before the first reset, and for rows that are done without autoreset.
         """
         action = self._check(actions)
-        over = self._is_over
+        over = self._is_over if self._life is None else self._is_over | self.rows.is_done.numpy()
         if over.any() or self.rows.uses_kernel:
             self._change_tasks(over)
             shown = self.rows.step_or_reset(action, torch.from_numpy(over))
@@ -257,13 +285,18 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
             shown = Shown(images, *self.rows.result(ends), ends)
         rewards = self.rows.reward.numpy().astype(np.float64)
         done = shown.done.numpy()
+        if self._life is not None:
+            self._age = np.where(self._is_over, 0, self._age + 1)
+            done = self._age == self._life
         if self.autoreset_mode == AutoresetMode.SAME_STEP and done.any():
             shown, infos = self._restart(done, shown)
         else:
             self._is_over = done
             infos = self._infos(shown)
         observation = add_id(shown.observation.numpy(), self._ids, self._numbers)
-        return observation, rewards, done.copy(), np.zeros_like(done), infos
+        never = np.zeros_like(done)
+        ends = (done.copy(), never) if self._life is None else (never, done.copy())
+        return observation, rewards, *ends, infos
 
     def _restart(self, done: RowMask, final: Shown) -> tuple[Shown, NamedValues]:
         """Start an episode in done rows; return what is shown then, and infos with what was shown last."""
@@ -273,7 +306,8 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         infos: NamedValues = {"final_obs": last, "_final_obs": done.copy()}
         infos |= {"final_info": self._infos(final, done), "_final_info": done.copy()}
         self._change_tasks(done)
-        shown = self.rows.reset(final.done)
+        self._age[done] = 0
+        shown = self.rows.reset(torch.from_numpy(done))
         return shown, infos | self._infos(shown)
 
     def _infos(self, shown: Shown, mask: RowMask | None = None) -> NamedValues:
@@ -369,6 +403,10 @@ def add_id(observation: NDArray[np.uint8], ids: NDArray[np.uint8] | None, task: 
 def _spaces(rows: Rows) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
     white = 255 if len(rows.image_shape) == 3 else rows.white
     return spaces.Box(0, white, rows.image_shape, np.uint8), spaces.Discrete(rows.max_branching + 1)
+
+
+def _life_rule(life: object) -> Rule:
+    return life is None or is_int(life, 1), f"life must be an integer >= 1 or None, got {life!r}"
 
 
 def _seed_rule(seed: object) -> Rule:

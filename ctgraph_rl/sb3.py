@@ -70,8 +70,11 @@ class SB3VecEnv(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """One step; done rows start an episode and have the last observation in ``terminal_observation``."""
-        observation, rewards, done, _, batch = self.envs.step(self._actions)
-        infos = _by_row(batch, **{"TimeLimit.truncated": False})
+        observation, rewards, terminated, truncated, batch = self.envs.step(self._actions)
+        done = terminated | truncated
+        infos = _by_row(batch)
+        for info, cut in zip(infos, truncated.tolist(), strict=True):
+            info["TimeLimit.truncated"] = cut
         ended = done.nonzero()[0].tolist()
         if ended:
             begun = _by_row(batch)
@@ -118,6 +121,6 @@ def _batch_rule(indices: VecEnvIndices) -> Rule:
     return indices is None, f"the rows are one batch: indices must be None, got {indices!r}"
 
 
-def _by_row(infos: NamedValues, **more: Any) -> list[NamedValues]:
+def _by_row(infos: NamedValues) -> list[NamedValues]:
     rows = zip(*(infos[key].tolist() for key in ("task", "outcome", "leaf")), strict=True)
-    return [{"task": task, "outcome": outcome, "leaf": leaf, **more} for task, outcome, leaf in rows]
+    return [{"task": task, "outcome": outcome, "leaf": leaf} for task, outcome, leaf in rows]

@@ -62,6 +62,35 @@ def test_the_vector_environment_equals_sync_vector_env_step_for_step(kind, mode)
 
 
 @every_mode
+def test_lives_hide_their_episodes_and_are_truncated_as_in_sync_vector_env(mode):
+    tasks = [VARIED["deterministic"], VARIED["waits and unique ids"]]
+    ours, theirs = both([*tasks, *tasks], mode, life=17)
+
+    played = [play(envs, 11, 60) for envs in (ours, theirs)]
+
+    assert_equal(*played)
+    steps = [result for result in played[0] if len(result) == 5]
+    ended, cut = (np.stack([result[place] for result in steps]) for place in (2, 3))
+    assert not ended.any()
+    assert cut[16].all() and cut.sum() == 4 * (60 // (17 + (mode == AutoresetMode.NEXT_STEP)))
+    assert sum((result[4]["outcome"] > 0).sum() for result in steps) > 20
+
+
+def test_the_last_state_of_an_episode_in_a_life_takes_one_more_action():
+    env = gymnasium.make("ctgraph/CT-SU-B1-v0", life=14)
+    env.reset(seed=0)
+    optimal = [0, 0, 1, 0, 1, 0]
+
+    steps = [env.step(action) for action in [*optimal, 2, *optimal, 2]]
+
+    rewards = [reward for _, reward, _, _, _ in steps]
+    assert rewards == [0, 0, 0, 0, 0, 1, 0] * 2
+    assert [truncated for _, _, _, truncated, _ in steps] == [False] * 13 + [True]
+    assert not any(terminated for _, _, terminated, _, _ in steps)
+    assert np.array_equal(steps[6][0], steps[13][0]) and not np.array_equal(steps[5][0], steps[6][0])
+
+
+@every_mode
 def test_rows_show_the_ids_of_their_tasks_as_sync_vector_env_does(mode):
     tasks = [surjective(goal=(2, 1)), surjective(goal=(1, 2)), surjective(goal=(1, 1))]
     ours, theirs = both(tasks, mode, task_ids=dict(zip(tasks, (2, 0, 3), strict=True)), num_task_ids=5)

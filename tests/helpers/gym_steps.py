@@ -42,7 +42,7 @@ def play(envs, seed, num_steps):
     num_actions = envs.single_action_space.n
     for _ in range(num_steps):
         results.append(envs.step(act(rng, envs.num_envs, num_actions)))
-        done = results[-1][2]
+        done = results[-1][2] | results[-1][3]
         if envs.metadata["autoreset_mode"] == AutoresetMode.DISABLED and done.any():
             results.append(envs.reset(options={"reset_mask": done.copy()}))
     return results
