@@ -54,7 +54,7 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
         render_mode: ``rgb_array``, ``ansi`` or None.
         kernel: ``"auto"``, ``"off"`` or ``"required"``, as in `Rows`.
         life: steps of a life, which is ``truncated`` then and hides where its episodes end: the last state of one takes
-            one more action, without effect, and the next starts. Only ``info`` says so. None: an episode at a time.
+            one more action, without effect, and the next starts. Only ``info`` tells outcomes. None: single episodes.
 
     Raises:
         ValueError: for values out of range.

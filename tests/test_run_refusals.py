@@ -69,6 +69,11 @@ REFUSED = [
         ["objective=online_return", "objective_until=1.5"],
         ["error: objective_until must be a share of the frames in (0, 1], such as 0.1, got 1.5\n"],
     ),
+    (
+        ["protocol.episodes=hidden", "agent=mohqa"],
+        ["error: MOHQA needs the ends of episodes, which are hidden: set protocol.episodes=shown\n"],
+    ),
+    (["protocol.episodes=none"], ["error: protocol.episodes must be one of shown, hidden, got 'none'\n"]),
     (["freeze_after=0"], ["error: freeze_after must be a share of the frames in (0, 1], such as 0.1, got 0\n"]),
     (["freeze_after=true"], ["freeze_after must be a share of the frames in (0, 1], such as 0.1, got True\n"]),
     (["objective_until=0.5"], ["error: objective_until=0.5 needs a metric, such as objective=online_return\n"]),

@@ -59,6 +59,10 @@ def life_of_blocks(log: RunLog, stream: Stream, count: int) -> NamedValues:
     zero = by_block(lambda task: task.fail_reward)
     step_reward = by_block(lambda task: task.step_reward)
     episodes, total, steps = _training(log, count)
+    paid = total + step_reward * (frames - steps)
+    hides = stream.protocol.hides_episodes
+    if hides:
+        paid[step_reward != 0] = torch.nan  # steps between episodes pay nothing, and the log does not count them
     first, *others = stream.examples
     seen = _evaluations(log, stream, count)
     curves = LifeCurves(
@@ -70,8 +74,8 @@ def life_of_blocks(log: RunLog, stream: Stream, count: int) -> NamedValues:
         lagged=seen.lagged,
         best=best,
         zero=zero,
-        reward=total + step_reward * (frames - steps),
-        gain=by_block(optimal_gain),
+        reward=paid,
+        gain=by_block(lambda task: optimal_gain(task, pause=int(hides))),
         alike=all(replace(task, goal=first.goal) == first for task in others),  # type: ignore[call-overload]
     )
     noisy = not stream.evaluation.exact and any(task.reward_std for task in stream.examples)

@@ -14,10 +14,13 @@ BISECTIONS = 80
 """Halvings of the interval in which the largest gain lies; float64 has 53 bits."""
 
 
-def optimal_gain(task: Task) -> float:
+def optimal_gain(task: Task, pause: int = 0) -> float:
     """Return g*, the largest E[return] / E[length] of any policy.
 
     The best value of episodes that pay g for every step is 0 at g = g*, and falls with g (Dinkelbach 1967).
+
+    Args:
+        pause: steps without a reward between two episodes: 1 where these are hidden.
 
     Example:
         >>> from ctgraph_rl.tasks.configurations import ct_fo_b1
@@ -25,21 +28,21 @@ def optimal_gain(task: Task) -> float:
         1.0
     """
     low, high = -1.0, 1.0
-    while _surplus(task, low) < 0:
+    while _surplus(task, low, pause) < 0:
         low *= 2
-    while _surplus(task, high) > 0:
+    while _surplus(task, high, pause) > 0:
         high *= 2
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
-        if _surplus(task, middle) > 0:
+        if _surplus(task, middle, pause) > 0:
             low = middle
         else:
             high = middle
     return (low + high) / 2
 
 
-def _surplus(task: Task, gain: float) -> float:
-    return optimal_value(replace(task, step_reward=task.step_reward - gain), 1.0)
+def _surplus(task: Task, gain: float, pause: int) -> float:
+    return optimal_value(replace(task, step_reward=task.step_reward - gain), 1.0) - pause * gain
 
 
 class Lost(NamedTuple):

@@ -37,6 +37,17 @@ def ids(name, num_envs):
     return make_vec_env(f"ctgraph/{name}-v0", n_envs=num_envs, env_kwargs={"goal": GOAL})
 
 
+def test_a_life_is_truncated_at_its_end_and_no_episode_ends_before():
+    envs = SB3VecEnv(2, "CT-SU-B1", life=9)
+    envs.reset()
+
+    steps = [envs.step(np.full(2, 1)) for _ in range(10)]
+
+    assert [done.tolist() for _, _, done, _ in steps] == [[False] * 2] * 8 + [[True] * 2, [False] * 2]
+    assert [infos[0]["TimeLimit.truncated"] for _, _, _, infos in steps] == [False] * 8 + [True, False]
+    assert "terminal_observation" in steps[8][3][1]
+
+
 def mean_return(model, name):
     mean, _ = evaluate_policy(model, make_vec_env(f"ctgraph/{name}-v0", seed=1000, env_kwargs={"goal": GOAL}), 50)
     return mean

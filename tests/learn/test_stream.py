@@ -55,6 +55,20 @@ def test_rows_see_the_images_of_their_blocks_task(boundaries):
             assert all((image == before).all(-1).all(-1).any() for image in batch["observation"][row][:changed])
 
 
+def test_regret_in_frames_of_hidden_episodes_counts_the_step_between_two():
+    life = stream(SAMPLED, {"episodes": "hidden"})
+    agent = Scripted(at_random, num_envs=4, num_steps=16)
+
+    found = scores(learn_curriculum(life, agent), life)
+
+    paid = sum(batch["next", "reward"].double().sum().item() for batch in agent.batches)
+    task = life.tasks[0]
+    gain = 1 / (task.graph.expected_episode_length + 1)
+    assert found["frame_regret"].value == pytest.approx(5 * 64 * gain - paid, abs=1e-5)
+    costly = stream(SAMPLED, {"episodes": "hidden"}, step_reward=-0.25)
+    assert scores(learn_curriculum(costly, agent), costly)["frame_regret"].value is None
+
+
 @pytest.mark.parametrize("rewards", [{}, {"step_reward": -0.25, "fail_reward": -2.0}])
 def test_regret_in_frames_is_of_every_reward_and_in_episodes_of_finished_ones(rewards):
     life = stream(SAMPLED, **rewards)
