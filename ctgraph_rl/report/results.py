@@ -190,7 +190,8 @@ def _no_measure(unknown: Sequence[str], choices: Iterable[str]) -> str:
     known = list(choices)
     near = [nearest(name, known) for name in unknown]
     meant = ", ".join(dict.fromkeys(filter(None, near)))
-    hint = f"did you mean {meant}?" if meant else f"there are {len(known)}, such as {', '.join(known[:4])}"
+    such = f"there are {len(known)}, such as {', '.join(known[:2])}; --all shows them"
+    hint = f"did you mean {meant}?" if meant else such
     own = "of your own, import its module in your agent's module or training script, and run again"
     return (
         f"no run has a measure {', '.join(map(repr, unknown))}: {hint}; to have one {own} (docs/how-to/own_metric.md)"

@@ -20,7 +20,7 @@ from studies.memory.conditions import (
     finished,
 )
 from studies.memory.runs import AGENTS, count, mean, returns, solved, solved_once
-from studies.raw import Raw, interval_of, shown, table
+from studies.raw import Raw, shown, table
 from studies.verdicts import ALPHA, undecided
 
 RIVALS = (
@@ -170,12 +170,6 @@ def better_than_poor(condition: Condition) -> str:
     """Return the rivals that more than `POOR` seeds solve a graph with."""
     of = columns([condition])[condition]
     return listed([AGENTS[name] for name in RIVALS if sum(solved(of[name])) > POOR])
-
-
-def intervals() -> str:
-    """Return the interval of the probability to solve a task for each number of seeds of five."""
-    found = (statistics.solved_rate([place < number for place in range(5)]) for number in range(6))
-    return ", ".join(f"{number} of 5{interval_of(each)}" for number, each in enumerate(found))
 
 
 def listed(names: Sequence[str]) -> str:

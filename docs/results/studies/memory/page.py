@@ -43,7 +43,7 @@ def texts() -> dict[str, str]:
     found["lower"], found["undecided"] = graphs.lower_and_undecided()
     found |= {"lost": graphs.lost(), "with_noise": graphs.with_noise()}
     found |= {"solve_shared": graphs.better_than_poor(SHARED), "solve_unique": graphs.better_than_poor(UNIQUE)}
-    return found | ladder.texts() | {"intervals": graphs.intervals(), "published": published()}
+    return found | ladder.texts() | {"published": published()}
 
 
 def page() -> str:
