@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from itertools import compress
+from itertools import chain, compress, pairwise
 from pathlib import Path
+from statistics import fmean
 
 from ctgraph_rl.checks import positive, require
 from ctgraph_rl.core.goal import write_goal
@@ -19,11 +20,12 @@ from ctgraph_rl.log.sheets import to_latex as to_latex
 from ctgraph_rl.log.sheets import to_markdown as to_markdown
 from ctgraph_rl.runs.config import curriculum_of
 from ctgraph_rl.runs.settings import curriculum_names
-from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.curriculum import LAGS, Curriculum, Stream
 from ctgraph_rl.tasks.kinds.task_like import TaskLike
 from ctgraph_rl.tasks.memory import bank_bytes
 from ctgraph_rl.tasks.observability import POLICIES, state_entropy, states_per_observation
 from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
+from ctgraph_rl.tasks.similarity import shared_images, state_agreement
 from ctgraph_rl.tasks.task import Task, are_graphs, ct_graphs
 from ctgraph_rl.tasks.values import open_loop_ceiling, random_frames_to_goal
 
@@ -33,8 +35,16 @@ AGENT, FRAMES_PER_SECOND = "lstm_ppo", 18_000
 SECONDS_OF_AN_ID = 4e-8
 """Further seconds a frame per number of a one-hot task id."""
 
+SECONDS_OF_A_MEAN = 2e-3
+"""Time of an exact evaluation of a task of a stream, without memory."""
+
 SECONDS_OF_A_STEP, SECONDS_OF_A_ROW = 5e-3, 1.3e-5
 """Time of this agent's evaluation step: in all, and per parallel episode."""
+
+OF_A_LIFE = "the present task, and at block ends of the next one and those 1, 10 and 100 blocks before"
+
+MOST_SHOWN = 20
+"""Blocks of a stream that are shown."""
 
 UNKNOWN = "-"
 
@@ -106,12 +116,13 @@ def describe(curriculum: Curriculum, frames_per_second: float | None = None) -> 
     """
     require(*(positive(frames_per_second=frames_per_second) if frames_per_second is not None else ()))
     overview = _overview(curriculum, frames_per_second)
-    if not are_graphs(curriculum.tasks):
+    if not are_graphs(curriculum.examples):
         return [overview, _other_blocks(curriculum)]
     return [overview, _blocks(curriculum), _difficulty(curriculum), _ceilings(curriculum), _observations(curriculum)]
 
 
 def _overview(curriculum: Curriculum, frames_per_second: float | None) -> Sheet:
+    seen = OF_A_LIFE if isinstance(curriculum, Stream) else "the tasks seen so far"
     rows = {
         "version": str(curriculum.version),
         "fingerprint": curriculum.fingerprint,
@@ -120,9 +131,11 @@ def _overview(curriculum: Curriculum, frames_per_second: float | None) -> Sheet:
         "tasks": f"{len(curriculum.tasks):,}",
         "frames": f"{curriculum.num_frames:,}",
         "protocol": protocol_in_words(curriculum.protocol, len(curriculum.tasks)),
-        "evaluation": evaluation_in_words(curriculum.evaluation),
+        "evaluation": evaluation_in_words(curriculum.evaluation, seen),
     }
-    if are_graphs(curriculum.tasks):
+    if isinstance(curriculum, Stream):
+        rows["neighbours"] = _neighbours(curriculum)
+    if are_graphs(curriculum.examples):
         bank, per_row = memory(curriculum)
         evaluations = _duration(_evaluation_seconds(curriculum))
         rows["memory"] = f"{bank:,} bytes of images, and {per_row:,} for each row"
@@ -131,7 +144,18 @@ def _overview(curriculum: Curriculum, frames_per_second: float | None) -> Sheet:
 
 
 def _graphs(curriculum: Curriculum) -> Sequence[Task]:
-    return ct_graphs(curriculum.tasks, "this sheet")
+    return ct_graphs(curriculum.examples, "this sheet")
+
+
+def _neighbours(stream: Stream) -> str:
+    """Return how alike tasks in a row are, by the measures of `ctgraph_rl.tasks.similarity`."""
+    pairs = list(pairwise(stream.tasks[:MOST_SHOWN]))
+    if not pairs:
+        return "there is one task"
+    images = fmean(shared_images(pair)[0, 1].item() for pair in pairs)
+    actions = fmean(state_agreement(pair)[0, 1].item() for pair in pairs)
+    alike = f"{images:.0%} of images and {actions:.0%} of states with the same best actions"
+    return f"share {alike}, the mean of the first {len(pairs)} pairs"
 
 
 def _time(curriculum: Curriculum, frames_per_second: float | None) -> str:
@@ -147,6 +171,9 @@ def _time(curriculum: Curriculum, frames_per_second: float | None) -> str:
 
 def _evaluation_seconds(curriculum: Curriculum) -> float:
     how = curriculum.evaluation
+    if isinstance(curriculum, Stream):
+        of_a_block = 2 + len(LAGS) + (curriculum.blocks.num_frames // how.every if how.every else 0)
+        return SECONDS_OF_A_MEAN * of_a_block * len(curriculum.blocks)
     moments = how.before + (curriculum.num_frames // how.every if how.every else len(curriculum.ends))
     tasks = len(curriculum.tasks) / (2 if how.tasks == "seen" else 1) + len(how.held_out)
     rows = tasks * how.num_episodes / how.episodes_per_row
@@ -174,8 +201,8 @@ def protocol_in_words(protocol: Protocol, num_tasks: int) -> str:
     return said + guide * bool(protocol.guide_frames)
 
 
-def evaluation_in_words(evaluation: Evaluation) -> str:
-    """Return an evaluation in words."""
+def evaluation_in_words(evaluation: Evaluation, seen: str = "the tasks seen so far") -> str:
+    """Return an evaluation in words; ``seen`` says which tasks are, where not all."""
     how = "greedy" if evaluation.greedy else "sampled"
     in_row = f", {evaluation.episodes_per_row} in a row" if evaluation.episodes_per_row > 1 else ""
     moments = [
@@ -184,7 +211,7 @@ def evaluation_in_words(evaluation: Evaluation) -> str:
         *(["at block ends"] if evaluation.at_block_ends else []),
     ]
     held_out = f" and {len(evaluation.held_out)} held out" if evaluation.held_out else ""
-    which = {"all": "all tasks", "seen": "the tasks seen so far"}[evaluation.tasks]
+    which = {"all": "all tasks", "seen": seen}[evaluation.tasks]
     adapts = f", after {evaluation.adapt_episodes} to adapt" if evaluation.adapt_episodes else ""
     episodes = f"{evaluation.num_episodes} {how} episodes{in_row}{adapts}"
     if evaluation.exact:
@@ -194,15 +221,18 @@ def evaluation_in_words(evaluation: Evaluation) -> str:
 
 def _blocks(curriculum: Curriculum) -> Sheet:
     columns = {"block": "r", "task": "l", "b": "r", "d": "r", "p": "r", "goal": "l", "frames": "r"}
-    switches = any(block.switch is not None for block in curriculum.blocks)
-    labels = dict(zip(curriculum.tasks, curriculum.labels, strict=True))
+    switches = any(block.switch is not None for block in curriculum.example_blocks)
+    shown = curriculum.blocks[:MOST_SHOWN] if isinstance(curriculum, Stream) else curriculum.blocks
+    numbers = dict.fromkeys(chain.from_iterable(curriculum.trained[: len(shown)]))
+    labels = {curriculum.tasks[number]: curriculum.labels[number] for number in numbers}
     if switches:
         columns["switch"] = "l"
     rows = []
-    for number, block in enumerate(curriculum.blocks, 1):
+    for number, block in enumerate(shown, 1):
         for row in _block_rows(number, block, labels):
             rows.append(row[: len(columns)])
-    return Sheet("Blocks", columns, tuple(rows))
+    more = [f"The first {len(shown)} of {len(curriculum.blocks):,} blocks."] * (len(shown) < len(curriculum.blocks))
+    return Sheet("Blocks", columns, tuple(rows), tuple(more))
 
 
 def _other_blocks(curriculum: Curriculum) -> Sheet:
@@ -295,7 +325,7 @@ def _up_to(most: int) -> str:
 
 
 def _labelled(curriculum: Curriculum) -> Iterator[tuple[Task, str]]:
-    return zip(_graphs(curriculum), curriculum.labels, strict=True)
+    return zip(_graphs(curriculum), curriculum.example_labels, strict=True)
 
 
 def probabilities() -> Sheet:

@@ -11,12 +11,15 @@ from torch import Tensor
 
 from ctgraph_rl.draw.style import new_figure, save_figure
 from ctgraph_rl.log.escape import figure_text
-from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.curriculum import Curriculum, Stream
 from ctgraph_rl.tasks.similarity import MEASURES
 from ctgraph_rl.tasks.task import ct_graphs
 
 MOST_NUMBERS, MOST_LABELS = 8, 40
 """Tasks up to which a heat map shows numbers and labels."""
+
+MOST_STREAMED_TASKS = 32
+"""Tasks of a stream that are compared, its first ones."""
 
 
 def draw_similarity(curriculum: Curriculum, path: Path | str) -> None:
@@ -30,6 +33,8 @@ def draw_similarity(curriculum: Curriculum, path: Path | str) -> None:
         ModuleNotFoundError: without matplotlib; names the extra to install.
         ValueError: for tasks too large for a measure, or other than CT-graphs.
     """
+    if isinstance(curriculum, Stream):
+        curriculum = curriculum.first(min(len(curriculum.blocks), MOST_STREAMED_TASKS))
     tasks = ct_graphs(curriculum.tasks, "a figure of how alike tasks are")
     figure = new_figure(12, 7.6)
     figure.suptitle(f"{figure_text(curriculum.name)}: similarity of {len(tasks)} tasks")

@@ -73,5 +73,8 @@ def metrics_of(content: bytes) -> NamedValues:
 def _is_metric(metric: Any) -> bool:
     if not (isinstance(metric, dict) and {"value", "definition", "undefined"} <= metric.keys()):
         return False
-    number = metric["value"] is None or is_real(metric["value"], -LARGEST, LARGEST)
+    values = [metric["value"]]
+    if isinstance(metric.get("windows"), list):
+        values += metric["windows"]
+    number = all(value is None or is_real(value, -LARGEST, LARGEST) for value in values)
     return number and isinstance(metric["definition"], str) and isinstance(metric["undefined"], str | None)

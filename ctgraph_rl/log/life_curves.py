@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -14,13 +14,16 @@ from ctgraph_rl.checks import NamedValues
 from ctgraph_rl.log.run_log import RunLog, tuning_share
 from ctgraph_rl.metrics.inputs import INPUTS
 from ctgraph_rl.metrics.record import Undefined, float64, ratio
-from ctgraph_rl.metrics.windows import LifeCurves
+from ctgraph_rl.metrics.windows import NUM_WINDOWS, LifeCurves
 from ctgraph_rl.tasks.curriculum import LAGS, Stream
 from ctgraph_rl.tasks.gain import optimal_gain
 from ctgraph_rl.tasks.task import Task
 from ctgraph_rl.tasks.values import optimal_value
 
 NOT_OF_STREAMS = Undefined("a stream has too many tasks for a matrix: its metrics are those of windows")
+
+PARTS = 16
+"""Of a window, for curves of training."""
 
 NOISY = Undefined(
     "rewards have noise, so that means of episodes do not say what is adapted to: set evaluation.exact=true"
@@ -144,3 +147,49 @@ def _evaluations(log: RunLog, stream: Stream, count: int) -> _Seen:
 
 def _number(value: float | None) -> float:
     return math.nan if value is None else value
+
+
+def by_windows(log: RunLog) -> RunLog:
+    """Return a stream's log with a window of `NUM_WINDOWS` in place of each block and task, for tables and figures.
+
+    Evaluations are means over a window's tasks at their blocks' ends, training those of up to `PARTS` parts.
+    """
+    about = log.of_kind("run")[0]
+    ends: dict[int, NamedValues] = {}
+    for m in log.of_kind("evaluation"):
+        if m.get("moment") != "during":
+            ends.setdefault(m["block"], m)  # the first of a block is of its own task
+    training: dict[int, list[NamedValues]] = {}
+    for m in log.of_kind("training"):
+        training.setdefault(m["block"], []).append(m)
+    labels = []
+    lines = [{**ends[0], "label": ""}] if 0 in ends else []
+    blocks = torch.arange(1, about["life"] + 1, device="cpu")
+    for number, window in enumerate(blocks.tensor_split(min(NUM_WINDOWS, about["life"])), 1):
+        first, last = window[0].item(), window[-1].item()
+        labels.append(f"tasks {first:,}-{last:,}" if last > first else f"task {first:,}")
+        for part in window.tensor_split(min(PARTS, len(window))):
+            own = [m for block in part.tolist() for m in training.get(block, ())]
+            if own:
+                lines.append({"kind": "training", "block": number, **_mean_line(own)})
+        at_end = [ends[block] for block in window.tolist() if block in ends]
+        if at_end:
+            place = {"kind": "evaluation", "moment": "after", "block": number, "task": number, "held_out": False}
+            lines.append({**place, **_mean_line(at_end)})
+    found = RunLog()
+    found.torn_lines = log.torn_lines
+    found.measurements = [{**about, "tasks": labels, "trained": [[number] for number in range(1, len(labels) + 1)]}]
+    for line in lines:
+        found.measurements.append({**line, "label": labels[line.get("task", 1) - 1]})
+    return found
+
+
+def _mean_line(lines: Sequence[NamedValues]) -> NamedValues:
+    """Return the means of lines, by episodes where they count them, and the last line's place."""
+    line: NamedValues = {"frames": lines[-1]["frames"], "seconds": lines[-1].get("seconds", 0.0)}
+    for name in ("return_mean", "success_rate", "end_rate", "length_mean"):
+        known = [m for m in lines if m.get(name) is not None]
+        weight = sum(m.get("episodes") or 1 for m in known)
+        line[name] = sum(m[name] * (m.get("episodes") or 1) for m in known) / weight if known else None
+    line["episodes"] = sum(m.get("episodes") or 0 for m in lines) or None
+    return line

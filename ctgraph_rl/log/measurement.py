@@ -8,6 +8,7 @@ from typing import Any
 
 from ctgraph_rl.checks import LARGEST_INT, NamedValues, ReadOnlyValues, is_int, is_real, is_shallow, require
 from ctgraph_rl.strict import MAX_NESTING, json_value
+from ctgraph_rl.tasks.life import MOST_STREAMED
 
 MOST = 10**6
 """Largest number of a block or task: the length of tables."""
@@ -59,6 +60,7 @@ RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "config": (lambda value: value is None or isinstance(value, Mapping), "an object"),
     "trained": (_are_blocks, f"lists of numbers of tasks in 1..{MOST:,}"),
     "tasks": (partial(_are, _is_text), "a list of texts"),
+    "life": (lambda value: is_int(value, 1, MOST_STREAMED), f"an integer in 1..{MOST_STREAMED:,}"),
     "numbers": (is_int, "an integer"),
     **dict.fromkeys(("sources", "versions"), (_are_sources, "an object of texts")),
     "together": (_are_seeds, "a list of seeds"),

@@ -66,7 +66,9 @@ def provenance(curriculum: Curriculum, names: Iterable[str] | None = ()) -> Name
     `code`.
     """
     tasks: NamedValues = {}
-    if not isinstance(curriculum, Stream):  # whose tasks are drawn when they are needed
+    if isinstance(curriculum, Stream):  # whose tasks are drawn when they are needed
+        tasks["life"] = len(curriculum.blocks)
+    else:
         tasks["tasks"] = list(curriculum.labels)
         tasks["trained"] = [[number + 1 for number in block] for block in curriculum.trained]
     return {

@@ -15,6 +15,7 @@ from uuid import uuid4
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, require
 from ctgraph_rl.disk import read_regular, write_whole
 from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG, METRICS, MOST_BYTES_OF_METRICS
+from ctgraph_rl.metrics.windows import OF_LIFE
 from ctgraph_rl.strict import json_value
 
 FILES = "files"
@@ -27,21 +28,24 @@ RESULTS = (LOG, CURRICULUM, AGENT, METRICS)
 def write_metrics(path: Path | str, metrics: ReadOnlyValues, sums: ReadOnlyValues | None = None) -> None:
     """Write metrics as JSON: by name the value, definition, formula and source, or why it is undefined.
 
-    Terms are left out, as pairs of tasks grow with the square of tasks; `ctgraph_rl.log.scores.scores` has them.
+    Terms are left out, as pairs of tasks grow with the square of tasks; `ctgraph_rl.log.scores.scores` has them. Those
+    of windows of a life are few, and kept.
 
     Args:
         sums: of the other files of a run.
     """
-    content = {name: _without_terms(metric) for name, metric in metrics.items()}
+    content = {name: _values(name, metric) for name, metric in metrics.items()}
     if sums is not None:
         files = {**sums, METRICS: sum_of(_text(content))}
         content = {FILES: {"run": uuid4().hex, **files}, **content}
     write_whole(path, _text(content))
 
 
-def _without_terms(metric: Any) -> NamedValues:
+def _values(name: str, metric: Any) -> NamedValues:
     values = {**vars(metric), "n_seeds": 1, "interval": None}
-    del values["terms"]
+    terms = values.pop("terms")
+    if name in OF_LIFE:
+        values["windows"] = terms
     return values
 
 

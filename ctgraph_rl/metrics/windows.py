@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl.metrics.bounds import between, not_negative, of_changes, of_performance
-from ctgraph_rl.metrics.record import HERE, MASTERED, Undefined, defined, ratio
+from ctgraph_rl.metrics.record import HERE, MASTERED, METRICS, Undefined, defined, ratio
 
 NUM_WINDOWS = 10
 """Of a life, as equal as possible; fewer in a shorter life."""
@@ -168,11 +168,13 @@ def _retention(life: LifeCurves, lag: int) -> Tensor:
     """Return the windows' sums of returns ``lag`` blocks later, over the sum of all at the ends of their blocks."""
     if len(life.success) <= lag:
         raise Undefined(f"the life has {len(life.success)} blocks, and none is {lag} blocks after another")
-    own = life.returns[:-lag, -1] - life.zero[:-lag]
-    kept = life.lagged[lag][lag:] - life.zero[:-lag]
-    scale = torch.where((own + kept).isnan(), torch.nan, life.best[:-lag] - life.zero[:-lag])
-    whole = ratio(own, scale).nansum()
-    return torch.stack([ratio(part.nansum(), whole) for part in _windows(ratio(kept, scale))])
+    start = torch.full([lag], torch.nan, dtype=torch.float64, device="cpu")
+    own = torch.cat([start, life.progress[:-lag, -1]])
+    scale = torch.cat([start, (life.best - life.zero)[:-lag]])
+    kept = ratio(life.lagged[lag] - torch.cat([start, life.zero[:-lag]]), scale)
+    own = torch.where(kept.isnan(), torch.nan, own)
+    sums = torch.stack([part.nanmean() * part.isfinite().sum() for part in _windows(kept)])
+    return ratio(sums, own.nansum())
 
 
 @of_windows("ctgraph_rl/retention-1", "sum_i R_i(1 block later) / sum_i R_i(end of i's block)", aggregate=torch.sum)
@@ -224,3 +226,7 @@ def frame_regret(life: LifeCurves) -> Tensor:
     """
     lost = life.gain * life.frames - life.reward
     return torch.stack([part.sum() for part in _windows(lost)])
+
+
+OF_LIFE = tuple(name for name, entry in METRICS.items() if entry.required == ("life",))
+"""All metrics of lives, by name."""

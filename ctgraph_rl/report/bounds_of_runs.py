@@ -99,7 +99,7 @@ def bounds_of_curriculum(curriculum: Curriculum, evaluations: int = 1) -> Bounds
         evaluations: of each task, after those before training; needed for sums over time.
     """
     evaluation = curriculum.evaluation
-    tasks = (*curriculum.tasks, *evaluation.held_out)
+    tasks = (*curriculum.examples, *evaluation.held_out)
     of_evaluation = []
     of_episode = []
     try:
@@ -110,16 +110,18 @@ def bounds_of_curriculum(curriculum: Curriculum, evaluations: int = 1) -> Bounds
     except (AttributeError, ValueError):
         return NO_BOUNDS
     whole = _around(of_evaluation)
-    of_tasks = of_evaluation[: len(curriculum.tasks)]
-    shares = _shares(curriculum.tasks, of_tasks)
+    of_tasks = of_evaluation[: len(curriculum.examples)]
+    shares = _shares(curriculum.examples, of_tasks)
     regrets = UNBOUNDED
     if are_graphs(tasks):
         episodes = evaluation.row_episodes
         exact = [exact_search(task.graph.num_end_states, episodes).sum().item() for task in tasks]
         regrets = Bounds(min(exact) - episodes, max(exact))  # goals that a row misses beside the best search
     known = Known(*whole, len(of_tasks), evaluations, *shares, *regrets)
-    returns = dict(zip(curriculum.labels, of_tasks, strict=True))
-    alike = evaluation.greedy and are_graphs(curriculum.tasks) and all(t.is_deterministic for t in curriculum.tasks)
+    returns = dict(zip(curriculum.example_labels, of_tasks, strict=True))
+    alike = (
+        evaluation.greedy and are_graphs(curriculum.examples) and all(t.is_deterministic for t in curriculum.examples)
+    )
     return BoundsOfRuns(returns, known, _around(of_episode), one_episode=alike)
 
 

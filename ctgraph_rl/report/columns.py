@@ -8,6 +8,7 @@ from ctgraph_rl import metrics
 from ctgraph_rl.log.run_log import tuning_share
 from ctgraph_rl.metrics import METRICS, Trained
 from ctgraph_rl.metrics.curves import find_returns
+from ctgraph_rl.metrics.windows import OF_LIFE
 from ctgraph_rl.runs.read import Run, by_curriculum, histories
 from ctgraph_rl.tasks.curriculum import Curriculum
 
@@ -25,7 +26,7 @@ WHERE_KNOWN = (
 """Metrics that are shown where some run of a curriculum has a value."""
 
 
-def columns(trained: Trained, adapts: bool) -> tuple[str, ...]:
+def columns(trained: Trained, adapts: bool, is_life: bool = False) -> tuple[str, ...]:
     """Return the metrics that a table shows of a curriculum with or without a value.
 
     Transfer and forgetting need several blocks. Where each trains one task, and each task comes once, they are those of
@@ -34,7 +35,10 @@ def columns(trained: Trained, adapts: bool) -> tuple[str, ...]:
     Args:
         trained: for each block, its tasks; empty where unknown.
         adapts: whether rows adapt before they are evaluated.
+        is_life: whether it is a stream, whose metrics are `OF_LIFE`.
     """
+    if is_life:
+        return OF_LIFE
     tasks = [task for block in trained for task in set(block)]
     once = len(set(tasks)) == len(tasks) == len(trained)
     names = ["average_performance"]
@@ -61,7 +65,8 @@ def columns_of_runs(runs: Sequence[Run]) -> dict[str, tuple[str, ...]]:
     for name, some in by_curriculum(runs).items():
         known = histories(some)
         trained = max((history.trained for history in known), key=len, default=())
-        found[name] = columns(trained, any(history.adaptation for history in known))
+        is_life = any("life" in run.about for run in some)
+        found[name] = columns(trained, any(history.adaptation for history in known), is_life)
         if any(tuning_share(run.about) is not None for run in some):
             found[name] = "online_return", *found[name]
     return found

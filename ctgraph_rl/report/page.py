@@ -21,6 +21,7 @@ from ctgraph_rl.report.figures.gallery import CaptionedFigure, Gallery, Written
 from ctgraph_rl.report.figures.heatmaps import MOST_NAMES, transfer_maps
 from ctgraph_rl.report.figures.labels import label_strips
 from ctgraph_rl.report.figures.learning_curves import learning_curves, mean_curves, training_curves, unit_curves
+from ctgraph_rl.report.figures.life_windows import life_windows
 from ctgraph_rl.report.figures.trees import Trees, find_trees, task_trees
 from ctgraph_rl.report.latex import Table, as_cell, document
 from ctgraph_rl.report.names import colours_of, displayed
@@ -32,7 +33,7 @@ from ctgraph_rl.runs.read import Problem, Run, find_runs, why_left_out
 from ctgraph_rl.runs.settings import flat
 
 OF_SECTION: tuple[Callable[[Section], CaptionedFigure | None], ...] = (
-    *(mean_curves, learning_curves),
+    *(life_windows, mean_curves, learning_curves),
     *(training_curves, unit_curves, adaptation_curves, label_strips, profiles, improvements),
 )
 """Figures of all agents on a curriculum, in order; None for nothing to draw."""

@@ -32,6 +32,12 @@ LIFELONG = {
 OF_DETECTION = ("detection_delay", "false_alarms", "labels_per_task", "label_agreement")
 """Metrics that are shown; the file has all."""
 
+IN_WINDOWS = (
+    *("window_return", "window_regret", "window_solved", "jump_start"),
+    *("adaptation_frames", "never_adapted"),
+)
+"""Metrics whose terms are shown for each window of a stream."""
+
 LONGEST_LABEL = 24
 """Characters of a task's label in a table; a longer one loses its middle."""
 
@@ -75,7 +81,9 @@ def print_summary(run_dir: Path | str, console: Console | None = None) -> None:
     modified = modification(run)
     if modified:
         console.print(_text(f"{run.curriculum[0]}: {modified}"))
-    always = columns(history.trained, bool(history.adaptation))
+    always = columns(history.trained, bool(history.adaptation), "life" in run.about)
+    if "life" in run.about:
+        tables = [_life(name, run)]
     for table in (*tables, metrics_table(run.metrics, always)):
         console.print(table)
 
@@ -131,6 +139,19 @@ def _tasks(name: str, history: History, curves: Mapping[str, str]) -> Table:
         curve = [_text(curves.get(label, ""))] if curves else []
         numbers = (_shown(values[0]), _shown(best), str(-block) if best > 0 else "-", _shown(values[-1]))
         table.add_row(_text(short), *numbers, *curve)
+    return table
+
+
+def _life(name: str, run: Run) -> Table:
+    """Return a line for each window of a stream: its terms of the metrics."""
+    table = Table(title=_text(f"{name}: means over windows of tasks"))
+    table.add_column("window", no_wrap=True)
+    for metric in IN_WINDOWS:
+        table.add_column(measure_name(metric).removeprefix("window "), justify="right")
+    for number, label in enumerate(run.history.labels if run.history else ()):
+        terms = [run.windows(metric)[number] for metric in IN_WINDOWS]
+        shown = ["-" if math.isnan(term) else f"{term:z,.{0 if term >= 100 else 2}f}" for term in terms]
+        table.add_row(_text(label), *shown)
     return table
 
 

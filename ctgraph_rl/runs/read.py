@@ -23,6 +23,7 @@ from ctgraph_rl.learn.progress import Count, silent
 from ctgraph_rl.log.damage import metrics_of
 from ctgraph_rl.log.escape import listed
 from ctgraph_rl.log.files import FAILURE, LOG, METRICS, MOST_BYTES_OF_METRICS, no_run, without_sweeps_files
+from ctgraph_rl.log.life_curves import by_windows
 from ctgraph_rl.log.measurement import check, parsed
 from ctgraph_rl.log.provenance import is_ours, targets
 from ctgraph_rl.log.run_log import MOST_BYTES, SCHEMA, RunLog, label_of, tuning_share
@@ -164,9 +165,15 @@ class Run:
         found: dict[str, float | None] = {}
         for each in self.values:
             if each.metric == metric and each.task is not None:
-                is_last = each.moment != "during" and each.block == last_block
+                is_last = each.moment != "during" and (each.block == last_block or "life" in self.about)
                 found[each.task] = each.value if is_last else found.get(each.task)
         return found
+
+    def windows(self, metric: str) -> list[float]:
+        """The terms of a metric of lives, or NaN, for each task of ``history``, which is a window."""
+        terms = self.metrics.get(metric, {}).get("windows") or []
+        count = len(self.history.labels) if self.history is not None else 0
+        return [math.nan if term is None else term for term in [*terms, *[None] * count][:count]]
 
     @property
     def curriculum(self) -> CurriculumKey:
@@ -314,6 +321,7 @@ def read_run(path: Path) -> Run:
         settings[FOLDER] = str(path.resolve().parent)
     try:
         log = RunLog.read(file)
+        log = by_windows(log) if "life" in about else log
         values = list(_values(log))
         history = _history(log, values)
     except (ValueError, KeyError, TypeError, AttributeError) as error:

@@ -207,10 +207,18 @@ class Curriculum:
         """A short name for each of ``tasks``: the first of its parts, such as the goal, and what else differs."""
         return self.evaluated_labels[: len(self.tasks)]
 
+    @property
+    def example_labels(self) -> Sequence[str]:
+        """A short name for each of ``examples``."""
+        return self.labels
+
     @cached_property
     def evaluated_labels(self) -> Sequence[str]:
         """`labels`, then those of the held-out tasks."""
-        parts = [task.label_parts for task in (*self.tasks, *self.evaluation.held_out)]
+        return self._labels_of((*self.tasks, *self.evaluation.held_out))
+
+    def _labels_of(self, tasks: Sequence[TaskLike]) -> tuple[str, ...]:
+        parts = [task.label_parts for task in tasks]
         first = next(iter(parts[0]))
         differing = []
         for name in parts[0]:
@@ -330,6 +338,11 @@ class Stream(Curriculum):
         return Lazy(len(self.blocks), self.blocks.label)
 
     evaluated_labels = labels
+
+    @cached_property
+    def example_labels(self) -> tuple[str, ...]:
+        """A short name for each of ``examples``, by what differs."""
+        return self._labels_of(self.examples)
 
     @property
     def trained(self) -> Lazy[tuple[int, ...]]:

@@ -45,7 +45,7 @@ THREE = LifeCurves(
         ("adaptation_frames", [100.0, 50.0, 100.0], 250 / 3),
         ("never_adapted", [0.0, 0.0, 1.0], 1 / 3),
         ("adaptation_area", [0.725, 0.7, 0.375], 0.6),
-        ("retention_1", [0.57 / 1.45, 0.2 / 1.45], 0.77 / 1.45),  # of 0.95 and 1.0 / 2
+        ("retention_1", [None, 0.57 / 1.45, 0.2 / 1.45], 0.77 / 1.45),  # of 0.95 and 1.0 / 2
         ("frame_regret", [15.0, 20.0, 20.0], 55.0),
     ],
 )

@@ -46,8 +46,8 @@ PLACES = 160
 
 
 def learning_curves(section: Section) -> CaptionedFigure | None:
-    """Return all agents' curves at evaluations, a panel for each task; None without a finished run."""
-    if not section.finished:
+    """Return all agents' curves at evaluations, a panel for each task; None without a finished run, and of a stream."""
+    if not section.finished or "life" in section.one.about:
         return None
     tasks = left_out(len(section.labels), MOST_TASKS, "tasks")
     caption = (
@@ -70,8 +70,8 @@ def learning_curves(section: Section) -> CaptionedFigure | None:
 
 
 def mean_curves(section: Section) -> CaptionedFigure | None:
-    """Return all agents' mean return over tasks at evaluations; None without a finished run."""
-    if not section.finished:
+    """Return all agents' mean return over tasks at evaluations; None without a finished run, and of a stream."""
+    if not section.finished or "life" in section.one.about:
         return None
     caption = (
         f"Mean return over all {len(section.labels)} tasks at every evaluation of all of them, over the frames learned "

@@ -49,7 +49,7 @@ def task_trees(section: Section, result: Result, found: Trees) -> CaptionedFigur
 def draw_trees(trees: Trees, seed: int) -> Any:
     """Draw each task's tree and goal, with the agent's visits and actions, if any."""
     assert trees.curriculum is not None
-    tasks = list(zip(ct_graphs(trees.curriculum.tasks, "a tree"), trees.curriculum.labels, strict=True))[:MOST_TREES]
+    tasks = list(zip(ct_graphs(trees.curriculum.tasks[:MOST_TREES], "a tree"), trees.curriculum.labels, strict=False))
     deepest = max(task.graph.depth for task, _ in tasks)
     grid = panels(len(tasks), COLUMNS, min(0.4 * (2 * deepest + 4), 5.0), room=0)
     for axes, (task, label) in zip(grid.ravel(), tasks, strict=False):
@@ -65,8 +65,8 @@ def find_trees(run: Run) -> Trees:
         curriculum = Curriculum.from_json(run.path / CURRICULUM)
     except (OSError, ValueError) as error:
         return Trees(None, None, str(error))
-    if not are_graphs(curriculum.tasks):
-        kind = type(curriculum.tasks[0]).__name__
+    if not are_graphs(curriculum.examples):
+        kind = type(curriculum.examples[0]).__name__
         return Trees(None, None, f"they are of CT-graphs, and its tasks are of {kind}")
     if not (run.path / AGENT).exists():
         return Trees(curriculum, None, f"{run.path} has no {AGENT}, the weights of its agent")

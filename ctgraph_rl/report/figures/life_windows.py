@@ -1,0 +1,82 @@
+"""A stream by windows of its tasks: return, regret, tasks solved, and retention over lag."""
+
+from __future__ import annotations
+
+from statistics import fmean
+from typing import Any
+
+import numpy as np
+
+from ctgraph_rl.report.bounds_of_runs import curriculum_of
+from ctgraph_rl.report.figures.gallery import CaptionedFigure, left_out
+from ctgraph_rl.report.figures.learning_curves import named
+from ctgraph_rl.report.sections import Section
+from ctgraph_rl.report.style import MOST_AGENTS, agent_style, agents_legend, panels
+from ctgraph_rl.tasks.curriculum import LAGS, Stream
+from ctgraph_rl.tasks.gain import lost_by_policies
+
+LINES = {"optimal": "-", "search": "-.", "memoryless": "--", "random": ":"}
+"""Looks of policies that do not learn."""
+
+PANELS = {
+    "window_return": "return at the block's end",
+    "window_solved": "share of tasks solved",
+    "frame_regret": "regret per frame",
+}
+
+
+def life_windows(section: Section) -> CaptionedFigure | None:
+    """Return all agents' means over windows of a stream; None for other curricula, and without a finished run."""
+    if not section.finished or "life" not in section.one.about:
+        return None
+    shown = section.results[:MOST_AGENTS]
+    stream = curriculum_of(section.one)
+    caption = (
+        "Means over windows of successive tasks; retention is the share of a task's return, from failure to optimum, "
+        "that is left a number of blocks later. Lines: means over seeds, where all have a value; dots: seeds. Grey: "
+        f"what policies that do not learn lose, {', '.join(LINES)}, in closed form; the search starts anew in each "
+        f"block.{left_out(len(section.results), MOST_AGENTS, 'agents')}"
+    )
+    grid = panels(len(PANELS) + 1, 2, 2.2)
+    *of_windows, last = grid.ravel()[: len(PANELS) + 1]
+    for axes, (metric, title) in zip(of_windows, PANELS.items(), strict=True):
+        for position, result in enumerate(shown):
+            rows = [run.windows(metric) for run in result.finished]
+            if metric == "frame_regret":
+                rows = [_per_frame(row, section) for row in rows]
+            _draw(axes, range(1, len(section.labels) + 1), rows, agent_style(position, result.agent))
+        axes.set(xlabel=f"window of {section.one.about['life'] // len(section.labels):,} tasks", ylabel=title)
+    if isinstance(stream, Stream):
+        lost = [lost_by_policies(task, stream.blocks.num_frames) for task in stream.examples]
+        for name, look in LINES.items():
+            if all(name in each for each in lost):
+                per_frame = fmean(each[name].in_frames for each in lost) / stream.blocks.num_frames
+                of_windows[-1].axhline(per_frame, color="0.55", linestyle=look, linewidth=0.8, zorder=0)
+    for position, result in enumerate(shown):
+        rows = [[_value(run, f"retention_{lag}") for lag in LAGS] for run in result.finished]
+        _draw(last, LAGS, rows, agent_style(position, result.agent))
+    last.set(xlabel="blocks later", xscale="log", ylabel="retention")
+    last.set_xticks(LAGS, [str(lag) for lag in LAGS])
+    last.minorticks_off()
+    figure = grid[0, 0].figure
+    agents_legend(
+        figure, [(named(result), agent_style(position, result.agent)) for position, result in enumerate(shown)]
+    )
+    return CaptionedFigure("life", "A life by windows", caption, figure)
+
+
+def _per_frame(row: list[float], section: Section) -> list[float]:
+    lengths = np.diff(section.ends)
+    return [lost / frames for lost, frames in zip(row, lengths, strict=False)]
+
+
+def _value(run: Any, metric: str) -> float:
+    value = run.metrics.get(metric, {}).get("value")
+    return float("nan") if value is None else value
+
+
+def _draw(axes: Any, places: Any, rows: list[list[float]], look: dict[str, Any]) -> None:
+    if rows:
+        for row in rows:
+            axes.plot(places, row, color=look["color"], linestyle="", marker=".", markersize=2)
+        axes.plot(places, np.mean(rows, axis=0), **look)
