@@ -33,6 +33,9 @@ ReadOnlyValues = Mapping[str, Any]
 LARGEST_INT = 2**63 - 1
 """Of int64."""
 
+MOST_STREAMED = 100_000
+"""Most tasks of a stream."""
+
 LONGEST_NAME, LONGEST_PATH = 255, 4095
 """Bytes of a path's part, and of a path."""
 

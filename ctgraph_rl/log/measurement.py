@@ -6,9 +6,17 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
-from ctgraph_rl.checks import LARGEST_INT, NamedValues, ReadOnlyValues, is_int, is_real, is_shallow, require
+from ctgraph_rl.checks import (
+    LARGEST_INT,
+    MOST_STREAMED,
+    NamedValues,
+    ReadOnlyValues,
+    is_int,
+    is_real,
+    is_shallow,
+    require,
+)
 from ctgraph_rl.strict import MAX_NESTING, json_value
-from ctgraph_rl.tasks.life import MOST_STREAMED
 
 MOST = 10**6
 """Largest number of a block or task: the length of tables."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -15,7 +15,6 @@ from uuid import uuid4
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, require
 from ctgraph_rl.disk import read_regular, write_whole
 from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG, METRICS, MOST_BYTES_OF_METRICS
-from ctgraph_rl.metrics.windows import OF_LIFE
 from ctgraph_rl.strict import json_value
 
 FILES = "files"
@@ -25,26 +24,28 @@ RESULTS = (LOG, CURRICULUM, AGENT, METRICS)
 """Files of a run, in the order of writing; ``curriculum.json`` only for parts of this package's classes."""
 
 
-def write_metrics(path: Path | str, metrics: ReadOnlyValues, sums: ReadOnlyValues | None = None) -> None:
+def write_metrics(
+    path: Path | str, metrics: ReadOnlyValues, sums: ReadOnlyValues | None = None, of_windows: Collection[str] = ()
+) -> None:
     """Write metrics as JSON: by name the value, definition, formula and source, or why it is undefined.
 
-    Terms are left out, as pairs of tasks grow with the square of tasks; `ctgraph_rl.log.scores.scores` has them. Those
-    of windows of a life are few, and kept.
+    Terms are left out, as pairs of tasks grow with the square of tasks; `ctgraph_rl.log.scores.scores` has them.
 
     Args:
         sums: of the other files of a run.
+        of_windows: metrics whose terms are few, and kept as ``windows``.
     """
-    content = {name: _values(name, metric) for name, metric in metrics.items()}
+    content = {name: _values(name, metric, of_windows) for name, metric in metrics.items()}
     if sums is not None:
         files = {**sums, METRICS: sum_of(_text(content))}
         content = {FILES: {"run": uuid4().hex, **files}, **content}
     write_whole(path, _text(content))
 
 
-def _values(name: str, metric: Any) -> NamedValues:
+def _values(name: str, metric: Any, of_windows: Collection[str]) -> NamedValues:
     values = {**vars(metric), "n_seeds": 1, "interval": None}
     terms = values.pop("terms")
-    if name in OF_LIFE:
+    if name in of_windows:
         values["windows"] = terms
     return values
 

@@ -34,6 +34,7 @@ from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.saved import without_moments
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.log.sums import RESULTS, sums_of, write_metrics
+from ctgraph_rl.metrics.windows import OF_LIFE
 from ctgraph_rl.packages import check_packages
 from ctgraph_rl.runs import config
 from ctgraph_rl.runs.checkpoints import Checkpoints, RunState, newest_of_all, offer_all
@@ -358,7 +359,7 @@ def mark_failure(run_dir: Path) -> Iterator[None]:
 
 def write_results(log: RunLog, curriculum: Curriculum, run_dir: Path, experts: Sequence[RunLog] | None = None) -> None:
     """Write the metrics of a closed log, with the sums of all results."""
-    write_metrics(run_dir / METRICS, scores(log, curriculum, experts), sums_of(run_dir))
+    write_metrics(run_dir / METRICS, scores(log, curriculum, experts), sums_of(run_dir), OF_LIFE)
 
 
 def remove_results(run_dir: Path) -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeVar, overload
 
-from ctgraph_rl.checks import are_ints, is_int, is_real, make_fields_plain, one_of, require
+from ctgraph_rl.checks import MOST_STREAMED, are_ints, is_int, is_real, make_fields_plain, one_of, require
 from ctgraph_rl.core.goal import write_goal
 from ctgraph_rl.tasks.protocol import Block
 from ctgraph_rl.tasks.task import Task
@@ -17,9 +17,6 @@ from ctgraph_rl.tasks.task import Task
 Made = TypeVar("Made")
 
 ORDERS = ("similar", "dissimilar", "returning", "drifting", "conflicting")
-
-MOST_STREAMED = 100_000
-"""Most tasks of a stream."""
 
 IMAGE_SEEDS = 2**40
 """New image sets have a seed below this."""
