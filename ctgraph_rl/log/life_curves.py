@@ -158,7 +158,7 @@ def by_windows(log: RunLog) -> RunLog:
     ends: dict[int, NamedValues] = {}
     for m in log.of_kind("evaluation"):
         if m.get("moment") != "during":
-            ends.setdefault(m["block"], m)  # the first of a block is of its own task
+            ends.setdefault(m["block"], m)  # the first of a block is of the task that it trains
     training: dict[int, list[NamedValues]] = {}
     for m in log.of_kind("training"):
         training.setdefault(m["block"], []).append(m)

@@ -34,8 +34,8 @@ def life_windows(section: Section) -> CaptionedFigure | None:
     caption = (
         "Means over windows of successive tasks; retention is the share of a task's return, from failure to optimum, "
         "that is left a number of blocks later. Lines: means over seeds, where all have a value; dots: seeds. Grey: "
-        f"what policies that do not learn lose, {', '.join(LINES)}, in closed form; the search starts anew in each "
-        f"block.{left_out(len(section.results), MOST_AGENTS, 'agents')}"
+        f"what policies that do not learn lose, {', '.join(LINES)}, in closed form; each block starts a new search."
+        f"{left_out(len(section.results), MOST_AGENTS, 'agents')}"
     )
     grid = panels(len(PANELS) + 1, 2, 2.2)
     *of_windows, last = grid.ravel()[: len(PANELS) + 1]
