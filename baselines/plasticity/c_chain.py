@@ -87,7 +87,7 @@ class CChain(Plasticity):
     @torch.no_grad()
     def transform_minibatch(self, batch: Data) -> Data:
         other = self._draw(len(batch["action"]))
-        weights = self.agent.trainable
+        weights = self.agent.weights
         parts = self.earlier[0].split([weight.numel() for weight in weights])
         before = {name: part.view_as(weight) for name, part, weight in zip(self.names, parts, weights, strict=True)}
         reference = self.agent.with_others(before, outputs_of, other)
