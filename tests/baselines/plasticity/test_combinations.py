@@ -34,7 +34,7 @@ BUSY = {
     "shrink_and_perturb_soft": ["plasticity.shrink=0.9", "plasticity.perturb=0.1"],
 }
 TWO_BLOCKS = of(
-    Block(ONE, 64), Block(TWO, 64), task_id="at_boundaries", evaluation=Evaluation(1, greedy=False, before=False)
+    Block(ONE, 32), Block(TWO, 32), task_id="at_boundaries", evaluation=Evaluation(1, greedy=False, before=False)
 )
 
 
@@ -59,10 +59,10 @@ def together(make: Any, seeds: tuple[int, ...]) -> tuple[list, list[RunLog]]:
 
 
 VECTORISED = [name for name in PLASTICITIES if name != "upgd"]
-PAIRS = [f"{name} {agent}" for name in VECTORISED for agent in ("ppo", "lstm_ppo", "dqn")]
+PAIRS = [f"{name} {agent}" for name in VECTORISED for agent in ("a2c", "ppo", "lstm_ppo", "dqn")]
 
 
-@pytest.mark.parametrize("pair", others_slow(PAIRS, "redo ppo"))
+@pytest.mark.parametrize("pair", others_slow(PAIRS, "redo a2c"))
 def test_a_seed_learns_together_as_alone_whatever_the_others_are(compose, pair):
     name, agent = pair.split()
     make = maker(compose, agent, name)
@@ -105,14 +105,15 @@ def test_each_method_learns_with_each_plasticity_that_it_allows(compose, name, m
 
     log = learn_curriculum(TWO_BLOCKS, new_agent(TWO_BLOCKS, make, 0))
 
-    assert len(log.of_kind("training")) == 4
+    assert len(log.of_kind("training")) == 2
 
 
-@pytest.mark.parametrize("name", RECYCLING)
-@pytest.mark.parametrize("method", ["packnet", "mask_ri", "cka_rl"])
-def test_methods_that_fix_weights_refuse_recycling(compose, name, method):
-    with pytest.raises(ValueError, match="would draw again: take plasticity=none, or one that draws none"):
-        new_agent(TWO_BLOCKS, maker(compose, "ppo", name, method), 0)
+def test_methods_that_fix_weights_refuse_recycling(compose):
+    methods = ["packnet", "mask_ri", "cka_rl", "packnet", "mask_lc"]
+    for name, method in zip(RECYCLING, methods, strict=True):
+        agent = plastic(compose, made(compose, "plasticity", name)())
+        with pytest.raises(ValueError, match="would draw again: take plasticity=none, or one that draws none"):
+            made(compose, "method", method)().attach(agent, TWO_BLOCKS)
 
 
 def test_a_trunk_that_is_kept_refuses_recycling(compose):
