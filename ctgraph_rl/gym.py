@@ -17,6 +17,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
+from typing_extensions import override
 
 from ctgraph_rl.batch.assignment import find_numbers, require_num_ids
 from ctgraph_rl.batch.rows import Rows, seed_rule
@@ -24,7 +25,9 @@ from ctgraph_rl.checks import NamedValues, Rule, as_int, as_tuple, is_int, requi
 from ctgraph_rl.core.dynamics import NO_LEAF, OUTCOME_RUNNING, Shown, choose
 from ctgraph_rl.draw.pixels import render
 from ctgraph_rl.draw.text import as_text
+from ctgraph_rl.log.named_curricula import curriculum_named
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS, Json, make_task
+from ctgraph_rl.tasks.curriculum import Stream
 from ctgraph_rl.tasks.protocol import MOST_ROWS
 from ctgraph_rl.tasks.task import Task
 
@@ -373,6 +376,86 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         return _frames(self)
 
 
+class StreamVectorEnv(CTGraphVectorEnv):
+    """A stream for any trainer: all rows have the task of the present block, from their next episode on.
+
+    ``info`` also has ``task``, the number of the block in which the task came first, from 0; ``optimum``, its exact
+    best mean return; and, where an episode ends, as ``_regret`` says, ``regret``: the optimum less its return. The last
+    task stays once the stream is over.
+
+    Args:
+        num_envs: rows; a frame is one row for one step.
+        stream: a `Stream`; None: ``curriculum=stream`` with ``settings``.
+        seed: draws the tasks of a stream without a seed. `reset` starts the rows' random streams.
+        render_mode: as in `CTGraphVectorEnv`, also ``autoreset_mode``, ``kernel`` and ``life``.
+        settings: such as ``num_tasks=1000``.
+
+    Raises:
+        ValueError: for values out of range, and blocks that are not whole steps of the rows.
+
+    Example:
+        >>> envs = gymnasium.make_vec("ctgraph/Stream-v0", num_envs=4, num_tasks=10, num_frames=1024)
+        >>> envs.reset(seed=0)[1]["optimum"]
+        array([1., 1., 1., 1.])
+    """
+
+    @takes_numbers
+    def __init__(
+        self,
+        num_envs: int = 1,
+        stream: Stream | None = None,
+        *,
+        seed: int = 0,
+        render_mode: str | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        kernel: str = "auto",
+        life: int | None = None,
+        **settings: Any,
+    ) -> None:
+        made = curriculum_named("stream", **settings) if stream is None else stream
+        require((isinstance(made, Stream), f"stream must be a Stream, got {made!r:.80}"), seed_rule(seed))
+        self.stream = made.for_seed(seed)
+        require(self.stream.blocks[0].frame_rule(num_envs, "a block"))
+        self._optima = np.array([task.optimal_value(1.0) for task in self.stream.examples])
+        self._frames = 0
+        super().__init__(
+            num_envs,
+            self.stream.tasks[0],
+            task_pool=self.stream.tasks,
+            render_mode=render_mode,
+            autoreset_mode=autoreset_mode,
+            kernel=kernel,
+            life=life,
+        )
+
+    @override
+    def step(self, actions: NDArray[np.int64]) -> tuple[Any, NumpyArray, NumpyArray, NumpyArray, NamedValues]:
+        self._frames += self.num_envs
+        at_once = self.autoreset_mode == AutoresetMode.SAME_STEP  # the next episode starts in the step that ends one
+        if at_once:
+            self._start_block()
+        taken = super().step(actions)
+        if not at_once:
+            self._start_block()
+        return taken
+
+    def _start_block(self) -> None:
+        """Give rows the next task, if a block ends here."""
+        if self.stream.is_end(self._frames) and self._frames < self.stream.num_frames:
+            self.set_tasks([self.stream.tasks[self.stream.block_at(self._frames)]] * self.num_envs)
+
+    @override
+    def _infos(self, shown: Shown, mask: RowMask | None = None) -> NamedValues:
+        infos = super()._infos(shown, mask)
+        optimum = self._optima[[self.stream.blocks.choice(number) for number in self._numbers]]
+        ends = shown.done.numpy() & infos["_task"]
+        infos["optimum"] = np.where(infos["_task"], optimum, 0.0)
+        infos["_optimum"] = infos["_task"].copy()
+        infos["regret"] = np.where(ends, optimum - self.rows.episode_reward.numpy(), 0.0)
+        infos["_regret"] = ends
+        return infos
+
+
 def add_task_ids(
     space: spaces.Space[Any], pool: Sequence[Task], task_ids: Mapping[Task, int] | None, num_task_ids: int | None
 ) -> tuple[spaces.Space[Any], NDArray[np.uint8] | None]:
@@ -442,3 +525,4 @@ for _name in ("CTGraph", *CONFIGURATIONS):
         vector_entry_point="ctgraph_rl.gym:CTGraphVectorEnv",
         kwargs={"task": _name} if _name in CONFIGURATIONS else {},
     )
+gymnasium.register("ctgraph/Stream-v0", vector_entry_point="ctgraph_rl.gym:StreamVectorEnv")

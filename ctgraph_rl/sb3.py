@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from ctgraph_rl.checks import NamedValues, Rule, require, takes_numbers
-from ctgraph_rl.gym import CTGraphVectorEnv, add_id, add_task_ids
+from ctgraph_rl.gym import CTGraphVectorEnv, StreamVectorEnv, add_id, add_task_ids
+from ctgraph_rl.tasks.curriculum import Stream
 from ctgraph_rl.tasks.task import Task
 
 try:
@@ -19,6 +20,10 @@ try:
     from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 except ImportError as error:
     raise ImportError("ctgraph_rl.sb3 needs Stable-Baselines3: pip install stable-baselines3") from error
+
+
+TOLD = ("task", "outcome", "leaf", "optimum", "regret")
+"""Keys of infos, the last two of a stream."""
 
 
 class SB3VecEnv(VecEnv):
@@ -31,6 +36,7 @@ class SB3VecEnv(VecEnv):
         task_ids: the id of each task of the pool, such as ``curriculum.task_ids``. Observations are then a dict of
             ``observation`` and ``task_id``, uint8 [num_envs, num_task_ids]: the row's id as one-hot.
         num_task_ids: length of ``task_id``; None: just enough.
+        stream: as in `StreamVectorEnv`, in place of ``task``.
 
     Example:
         >>> envs = SB3VecEnv(256, "CT-SU-B1")
@@ -45,9 +51,14 @@ class SB3VecEnv(VecEnv):
         task: Any = None,
         task_ids: Mapping[Task, int] | None = None,
         num_task_ids: int | None = None,
+        stream: Stream | None = None,
         **kwargs: Any,
     ) -> None:
-        self.envs = CTGraphVectorEnv(num_envs, task, autoreset_mode=AutoresetMode.SAME_STEP, **kwargs)
+        same_step = AutoresetMode.SAME_STEP
+        if stream is None:
+            self.envs = CTGraphVectorEnv(num_envs, task, autoreset_mode=same_step, **kwargs)
+        else:
+            self.envs = StreamVectorEnv(num_envs, stream, autoreset_mode=same_step, **kwargs)
         alone = self.envs.single_observation_space
         space, self._ids = add_task_ids(alone, self.envs.task_pool, task_ids, num_task_ids)
         super().__init__(num_envs, space, self.envs.single_action_space)
@@ -122,5 +133,9 @@ def _batch_rule(indices: VecEnvIndices) -> Rule:
 
 
 def _by_row(infos: NamedValues) -> list[NamedValues]:
-    rows = zip(*(infos[key].tolist() for key in ("task", "outcome", "leaf")), strict=True)
-    return [{"task": task, "outcome": outcome, "leaf": leaf} for task, outcome, leaf in rows]
+    rows: list[NamedValues] = [{} for _ in infos["task"]]
+    for key in (key for key in TOLD if key in infos):
+        for row, value, known in zip(rows, infos[key].tolist(), infos[f"_{key}"].tolist(), strict=True):
+            if known:
+                row[key] = value
+    return rows

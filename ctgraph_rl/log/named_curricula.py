@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ctgraph_rl.packages import check_packages
 
@@ -11,11 +11,11 @@ if TYPE_CHECKING:
     from ctgraph_rl.tasks.curriculum import Curriculum
 
 
-def curriculum_named(name: str) -> Curriculum:
-    """Return a published curriculum.
+def curriculum_named(name: str, **arguments: Any) -> Curriculum:
+    """Return a published curriculum, changed by arguments.
 
     Raises:
-        ValueError: for an unknown name, with the choices; and as `check_packages`.
+        ValueError: for an unknown name or argument, with the choices; and as `check_packages`.
     """
     check_packages()
-    return import_module("curricula").load(name)
+    return import_module("curricula").load(name, **arguments)

@@ -227,3 +227,31 @@ def test_task_ids_that_leave_a_task_of_the_pool_out_are_refused():
 
     with pytest.raises(ValueError, match="task_ids must name every task of the pool"):
         SB3VecEnv(2, first, task_pool=(first, second), task_ids={first: 0})
+
+
+def test_regret_and_tasks_of_a_stream_reach_callbacks():
+    envs = SB3VecEnv(8, stream=curricula.load("stream", num_tasks=3, num_frames=80, depth=1, seed=4))
+    envs.reset()
+    seen = []
+
+    for step in range(40):
+        _, rewards, done, infos = envs.step(np.random.default_rng(step).integers(0, 3, 8))
+        for reward, over, info in zip(rewards, done, infos, strict=True):
+            assert ("regret" in info) == over
+            if over:
+                assert info["regret"] == 1.0 - reward
+        seen.append(max(info["task"] for info in infos))
+
+    assert seen[:10] == [0] * 10
+    assert seen[-1] == 2
+
+
+@pytest.mark.slow
+def test_ppo_learns_a_stream():
+    stream = curricula.load("stream", num_tasks=2, num_frames=64 * 512, depth=1, order="similar", seed=4)
+    envs = VecMonitor(SB3VecEnv(64, stream=stream))
+    agent = PPO("MlpPolicy", envs, n_steps=32, batch_size=512, learning_rate=3e-3, seed=0, device="cpu")
+
+    agent.learn(stream.blocks.num_frames)
+
+    assert np.mean([episode["r"] for episode in agent.ep_info_buffer]) > 0.9
