@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.log.sheets import FORMATS, LISTED, Sheet, show, with_numbers
+from ctgraph_rl.parsers import OneLineParser
 from curricula import listed
 
 
@@ -47,7 +48,7 @@ def _parser() -> argparse.ArgumentParser:
     form.add_argument("--format", choices=("text", *FORMATS), help="default: text")
     form.add_argument("--config-dir", type=Path, metavar="DIR", help="also knows the curricula of this directory")
     about = "List all curricula, or describe one."
-    parser = argparse.ArgumentParser(prog="ctgraph-rl curricula", description=about, parents=[form])
+    parser = OneLineParser(prog="ctgraph-rl curricula", description=about, parents=[form])
     commands = parser.add_subparsers(dest="command")
     commands.add_parser("list", help="list all, as without a command", parents=[form])
     commands.add_parser("probabilities", help="print the paper's Table 2, with its misprints corrected", parents=[form])

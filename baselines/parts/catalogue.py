@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-from argparse import ArgumentParser
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,6 +11,7 @@ import yaml
 
 from ctgraph_rl.checks import NamedValues
 from ctgraph_rl.packages import class_named, conf_dir
+from ctgraph_rl.parsers import OneLineParser
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -42,7 +42,7 @@ class CatalogueEntry(NamedTuple):
 
 def config_dir_of(command: str, description: str | None) -> Path | None:
     """Return the ``--config-dir`` of a listing command."""
-    parser = ArgumentParser(prog=f"ctgraph-rl {command}", description=description)
+    parser = OneLineParser(prog=f"ctgraph-rl {command}", description=description)
     parser.add_argument("--config-dir", type=Path, metavar="DIR", help="also lists those of this directory")
     folder: Path | None = parser.parse_args().config_dir
     if folder is not None and not folder.is_dir():

@@ -241,7 +241,7 @@ def verify() -> ArgumentParser:
     return parser
 
 
-class _Parser(ArgumentParser):
+class OneLineParser(ArgumentParser):
     """Refuses arguments in one line; ``--help`` shows the usage."""
 
     @override
@@ -250,7 +250,7 @@ class _Parser(ArgumentParser):
 
 
 def _parser(command: Callable[[], ArgumentParser]) -> ArgumentParser:
-    return _Parser(prog=f"ctgraph-rl {command.__name__}", description=command.__doc__)
+    return OneLineParser(prog=f"ctgraph-rl {command.__name__}", description=command.__doc__)
 
 
 def _add(parser: Any, name: str, help: str, type: Any = Path, **how: Any) -> None:

@@ -19,7 +19,7 @@ from ctgraph_rl.checks import NamedValues, ReadOnlyValues, as_path, is_int, requ
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.learn.evaluate import task_policies
 from ctgraph_rl.log.escape import terminal_text
-from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG
+from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG, no_run
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.saved import read_content, read_plain, require_records
 from ctgraph_rl.packages import class_named
@@ -86,7 +86,7 @@ def load(
     run_dir = as_path("run_dir", run_dir)
     device = checked_device(device)
     if not (run_dir / LOG).exists():
-        raise FileNotFoundError(f"{run_dir} holds no run: there is no {LOG}")
+        raise FileNotFoundError(no_run(run_dir, below=False))
     log = RunLog.read(run_dir / LOG)
     runs = log.of_kind("run")
     require((bool(runs), f"{run_dir / LOG} has no first line of a run; it was stopped before it began"))

@@ -252,7 +252,7 @@ def test_a_curriculum_of_other_classes_must_be_given(copy):
 
 
 def test_a_directory_without_a_run_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"holds no run: there is no run\.jsonl"):
+    with pytest.raises(FileNotFoundError, match=r"holds no run: no run\.jsonl in it; name a run directory"):
         load(tmp_path)
 
 
