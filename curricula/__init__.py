@@ -99,8 +99,8 @@ def _named() -> dict[str, Callable[..., Curriculum]]:
 def __getattr__(name: str) -> Any:
     if name in _HOMES:
         return getattr(import_module(f"curricula.{_HOMES[name]}"), name)
-    is_module = find_spec(f"{__name__}.{name}") is not None  # one that is being imported needs no other
-    if name.startswith("_") or is_module or name not in _named():
+    # a module that is being imported needs no other
+    if name.startswith("_") or find_spec(f"{__name__}.{name}") is not None or name not in _named():
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return _named()[name]
 
