@@ -20,8 +20,11 @@ from baselines.methods.parts.weights import Weights
 from baselines.parts.hooks import Hooks
 from baselines.parts.learner import Learner
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.checks import NamedValues, TakesNumbers, require
+from ctgraph_rl.checks import NamedValues, TakesNumbers, require, require_memory
 from ctgraph_rl.tasks.curriculum import Curriculum
+
+MOST_COPIES = 128
+"""Policies with other weights that are kept; a task beyond gets a new copy each time."""
 
 
 class Method(TakesNumbers, Hooks):
@@ -179,6 +182,13 @@ class TaskMethod(Method):
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         super().setup(agent, weights, curriculum)
         self.num_tasks = self.num_ids(curriculum)
+        self.bytes_per_task = 4 * self.num_kept(weights)
+        what = f"what {type(self).__name__} keeps of {self.num_tasks:,} tasks, {self.bytes_per_task:,} bytes each,"
+        require_memory(what, self.num_tasks * self.bytes_per_task, "tasks, such as curriculum.num_tasks")
+
+    def num_kept(self, weights: Weights) -> int:
+        """Return how many numbers it keeps for each task: one for each weight."""
+        return len(weights)
 
     @override
     def start_task(self, task: int | None) -> None:
@@ -249,6 +259,7 @@ class AgentWithMethod(nn.Module):
         self.num_steps = agent.num_steps
         self.policy: TensorDictModuleBase = agent.policy
         self._copies: dict[int, TensorDictModuleBase] = {}
+        """The last `MOST_COPIES` policies of tasks."""
 
     @property
     def method(self) -> Method:
@@ -268,6 +279,8 @@ class AgentWithMethod(nn.Module):
             return policy
         if task not in self._copies:
             self._copies[task] = deepcopy(policy)
+        if len(self._copies) > MOST_COPIES:
+            del self._copies[next(iter(self._copies))]
         copy = self._copies[task]
         copy.load_state_dict(policy.state_dict())
         self.method.weights.write_to(copy, weights)

@@ -14,7 +14,7 @@ from ctgraph_rl.checks import Rule, require
 from ctgraph_rl.core.rewards import KERNEL_REWARDS
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.exact import exact_rules
-from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.curriculum import Curriculum, Stream
 from ctgraph_rl.tasks.task import Task
 
 
@@ -122,8 +122,13 @@ def check_adaptation(curriculum: Curriculum, agent: Agent) -> None:
     )
 
 
-def notes(curriculum: Curriculum) -> Iterator[str]:
-    """Yield what to know of a curriculum before a run."""
+def notes(curriculum: Curriculum, agent: Agent) -> Iterator[str]:
+    """Yield what to know of a curriculum, and of an agent on it, before a run."""
+    method = getattr(agent, "method", None)
+    kept = getattr(method, "bytes_per_task", 0)
+    if kept and isinstance(curriculum, Stream):
+        whole = kept * len(curriculum.blocks)
+        yield f"{type(method).__name__} keeps {kept:,} bytes for each task, {whole:,} in all, and in each checkpoint"
     rewards = {type(task.reward_fn) for task in curriculum.examples if isinstance(task, Task)}
     slow = sorted(kind.__name__ for kind in rewards - {*KERNEL_REWARDS})
     if slow:

@@ -352,7 +352,7 @@ def learn(
     curriculum = members[first.seed].curriculum
     if first.experts and not curriculum.evaluation.every:
         print("note: forward transfer against experts needs evaluations within blocks: set evaluation.every")
-    for note in notes(curriculum):
+    for note in notes(curriculum, members[first.seed].agent):
         print(f"note: {note}")
     for cfg, _ in cells:
         prepare(session, cfg, members[cfg.seed])

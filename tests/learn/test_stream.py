@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from unittest.mock import patch
 
 import pytest
 import torch
@@ -11,7 +12,10 @@ from helpers.scripted import Scripted
 from helpers.stopped_runs import logs_of_equal_ends, make_agent
 
 import curricula
+from baselines.methods.method import MOST_COPIES
+from baselines.methods.scratch import Scratch
 from ctgraph_rl import RunLog, learn_curriculum
+from ctgraph_rl.learn.refusals import notes
 from ctgraph_rl.learn.stacked import why_not_together
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.runs.train import new_agent
@@ -149,3 +153,33 @@ def test_ids_of_a_stream_are_those_of_first_blocks():
 
     shown = [batch["task_id"].long().argmax(-1).unique().tolist() for batch in agent.batches]
     assert shown == [[0], [1], [0], [1], [0]]
+
+
+def test_a_method_tells_what_it_keeps_for_each_task_and_is_refused_beyond_memory():
+    life = stream(num_tasks=100, protocol={"task_id": "at_boundaries"})
+    agent = Scratch().attach(learner(life), life)
+    weights = sum(parameter.numel() for parameter in agent.agent.policy.parameters())
+    endless = stream(num_tasks=100_000, protocol={"task_id": "at_boundaries"}, num_frames=64)
+
+    (note,) = notes(life, agent)
+
+    assert (
+        note == f"Scratch keeps {4 * weights:,} bytes for each task, {400 * weights:,} in all, and in each checkpoint"
+    )
+    with (
+        patch("ctgraph_rl.checks.memory_bytes", lambda: 100_000),
+        pytest.raises(ValueError, match="this machine has 100,000; use fewer tasks"),
+    ):
+        Scratch().attach(learner(life), endless)
+
+
+def test_an_agent_keeps_copies_of_its_policy_for_few_tasks():
+    life = stream(num_tasks=200, num_frames=64, protocol={"task_id": "at_boundaries"})
+    agent = Scratch().attach(learner(life), life)
+    for task in range(200):
+        agent.start_task(task)
+
+    policies = [agent.policy_for(task) for task in range(199)]
+
+    assert len({id(policy) for policy in policies}) == 199
+    assert len(agent._copies) == MOST_COPIES

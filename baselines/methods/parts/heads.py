@@ -31,6 +31,10 @@ class Heads(TaskMethod):
         require((bool(self.in_heads.any()), f"{message}: take a method that shares them, as some do with heads=single"))
         self.register_buffer("kept", weights.vector().detach()[self.in_heads].repeat(self.num_tasks, 1))
 
+    @override
+    def num_kept(self, weights: Weights) -> int:
+        return int(weights.in_heads.sum())
+
     @torch.no_grad()
     def start_task(self, task: int | None) -> None:
         """Load the task's output layers, and clear their optimiser state."""
