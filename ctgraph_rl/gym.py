@@ -298,8 +298,9 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
             infos = self._infos(shown)
         observation = add_id(shown.observation.numpy(), self._ids, self._numbers)
         never = np.zeros_like(done)
-        ends = (done.copy(), never) if self._life is None else (never, done.copy())
-        return observation, rewards, *ends, infos
+        if self._life is None:
+            return observation, rewards, done.copy(), never, infos
+        return observation, rewards, never, done.copy(), infos
 
     def _restart(self, done: RowMask, final: Shown) -> tuple[Shown, NamedValues]:
         """Start an episode in done rows; return what is shown then, and infos with what was shown last."""

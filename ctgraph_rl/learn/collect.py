@@ -99,8 +99,8 @@ def agent_specs(curriculum: Curriculum) -> Specs:
         ValueError: if the tasks cannot be rows of one environment.
     """
     pool, length = _pool_and_ids(curriculum)
-    if are_graphs(curriculum.examples):
-        examples = (*curriculum.examples, *curriculum.evaluation.held_out)
+    examples = (*curriculum.examples, *curriculum.evaluation.held_out)
+    if are_graphs(examples):
         return make_specs(examples, num_task_ids=length, info=not curriculum.protocol.hides_episodes)
     env = make_env(curriculum, pool[:1], 0)
     try:

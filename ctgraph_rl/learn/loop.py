@@ -273,7 +273,7 @@ class Lockstep:
                 if self.frames < self.last_learned:
                     self.group.start_task(announced_id(self.curriculum, segment.blocks[0]))
                 self._measure_units(self.curriculum.block_at(segment.start + 1), "start")
-            restore = None if saved is None else partial(self._restore, saved)
+            restore: Callable[[], TensorDictBase] | None = None if saved is None else partial(self._restore, saved)
             if self.frames == segment.start > 0 and self.curriculum.protocol.hides_episodes:
                 restore = self._start_unnoticed
             batches = collect_segment(

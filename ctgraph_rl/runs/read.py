@@ -290,7 +290,8 @@ def _tuning_notes(runs: Sequence[Run]) -> Iterator[Problem]:
     for (name, agent, share), some in split_by(runs, _tuned).items():
         trials = len({run.alike for run in some})
         seeds = listed(sorted({run.seed for run in some}), MOST_SEEDS)
-        what = f"{len(some)} tuning runs of {agent} on {name}: {trials} trials, seeds {seeds}"
+        runs_of = f"{len(some)} tuning run{'s' * (len(some) > 1)} of {agent} on {name}"
+        what = f"{runs_of}: {trials} trial{'s' * (trials > 1)}, seeds {seeds}"
         reason = f"{what}, the first {share:g} of the frames; --tuning shows them"
         yield Problem(some[0].path, reason, is_error=False)
 

@@ -139,4 +139,4 @@ def test_a_tuning_run_has_metrics_of_training_alone_and_tables_leave_it_out_unle
     results_main()
     said = capsys.readouterr()
     assert "n = 1" in said.out and "objective_until" not in said.out
-    assert "1 tuning runs of PPO on su_b1_4tasks: 1 trials, seeds 100, the first 0.5 of the frames" in said.err
+    assert "1 tuning run of PPO on su_b1_4tasks: 1 trial, seeds 100, the first 0.5 of the frames" in said.err
