@@ -118,7 +118,7 @@ def _norm(tensors: list[Tensor]) -> float:
 
 
 def task_images(task: Task, shape: tuple[int, ...]) -> Tensor:
-    """Return the different images of a task's states, padded to ``shape``, uint8 [n, *shape]."""
+    """Return the images of a task's states, padded to ``shape``, uint8 [n, *shape]."""
     views = task.images.num_variants * (task.observations.read_rotation + 1)
     ids: dict[int, None] = {}
     for kind in StateType:
@@ -126,7 +126,7 @@ def task_images(task: Task, shape: tuple[int, ...]) -> Tensor:
         ids |= dict.fromkeys(range(first, last + 1))
     places = torch.tensor([*ids], dtype=torch.int64, device="cpu").unsqueeze(1)
     rows = (places * views + torch.arange(views, device="cpu")).flatten()
-    return ShownTask(task, shape, None).bank.index_select(0, rows).unique(dim=0)
+    return ShownTask(task, shape, None).bank.index_select(0, rows)
 
 
 def fresh_images(task: Task) -> Tensor | None:

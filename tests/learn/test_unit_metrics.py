@@ -96,6 +96,15 @@ def test_a_rank_is_a_share_of_the_images_where_they_are_fewer_than_units():
     assert found["rank_srank"] == found["rank_stable"] == 1
 
 
+def test_equal_rows_change_no_rank_where_they_share_a_weight():
+    """A row of half of all, twice as two quarters; unweighted, the singular values would differ."""
+    once = unit_metrics({"a": layer([1.0, 0.0], [0.0, 1.0])})
+    twice = unit_metrics({"a": layer([1.0, 0.0], [0.0, 1.0], [0.0, 1.0], shares=[0.5, 0.25, 0.25])})
+
+    for name in ("rank_effective", "rank_stable"):
+        assert twice[name] == pytest.approx(once[name])
+
+
 def test_three_ranks_of_the_same_singular_values_differ_as_defined():
     """Singular values 3, 1, 0.03, 0: srank sums them, not their squares; only the stable rank squares them."""
     sigma = [3.0, 1.0, 0.05, 0.0]
@@ -177,7 +186,9 @@ class Zeros:
 
 
 def test_a_meter_appends_a_line_for_task_images_and_one_for_fresh_ones():
-    curriculum = Curriculum("mine", 1, "", (Block(ct_fo_b1(), 8), Block(ct_fo_b1(image_seed=2), 8)))
+    """Two goals of a block show the same 16 images."""
+    goals = (ct_fo_b1("1.1", image_seed=2), ct_fo_b1("2.2", image_seed=2))
+    curriculum = Curriculum("mine", 1, "", (Block(ct_fo_b1(), 8), Block(goals, 8)))
     log = RunLog()
 
     UnitMeter(curriculum, Zeros(), log, True).measure(2, 8, "start")
