@@ -13,7 +13,7 @@ from torch import Tensor
 
 from baselines.parts.live_ids import only_live_ids
 from baselines.parts.networks import Data, Items, TensorsByName
-from baselines.parts.units import Activations, activations
+from baselines.parts.units import Activations, activations, hidden_layers
 from baselines.update.compiled import compiled
 from baselines.update.measured import finite_means, table_of
 from baselines.update.trained import Trained
@@ -119,6 +119,11 @@ class Learner(TakesNumbers, Trained):
     def one_step(self, data: Data) -> Items:
         """Return `outputs` for one step of all rows, and with memory the next state under ``("next", key)``."""
         return dict(self.outputs(data))
+
+    @property
+    def tells_units(self) -> bool:
+        """Whether its hidden layers are known."""
+        return bool(hidden_layers(self.policy))
 
     def activations(self, data: Data) -> Activations:
         """Return the hidden units' activations for one step of all rows, as `baselines.parts.units.activations`."""

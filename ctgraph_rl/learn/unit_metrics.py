@@ -143,8 +143,8 @@ def unit_rules(curriculum: Curriculum, agent: Agent) -> Iterator[Rule]:
     yield are_graphs(curriculum.examples), f"log_units needs CT-graphs, whose images are known, got {kind}: {off}"
     learner = getattr(agent, "unwrapped", agent)
     name = type(learner).__name__
-    known = hasattr(learner, "activations")
-    yield known, f"log_units needs an agent that tells its hidden units by `activations`, which {name} lacks: {off}"
+    known = hasattr(learner, "activations") and getattr(learner, "tells_units", True)
+    yield known, f"log_units needs an agent that tells its hidden units, which {name} does not: {off}"
 
 
 class UnitMeter:

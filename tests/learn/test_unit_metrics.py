@@ -185,6 +185,13 @@ class Zeros:
         return {"only": (torch.cat([0 * ones, ones], dim=1), ones[:, 0] / len(ones))}
 
 
+def unknown() -> Zeros:
+    """A learner whose layers are not known."""
+    made = Zeros()
+    made.tells_units = False
+    return made
+
+
 def test_a_meter_appends_a_line_for_task_images_and_one_for_fresh_ones():
     """Two goals of a block show the same 16 images."""
     goals = (ct_fo_b1("1.1", image_seed=2), ct_fo_b1("2.2", image_seed=2))
@@ -271,7 +278,8 @@ def test_with_memory_the_cells_outputs_are_units_too():
 @pytest.mark.parametrize(
     ("curriculum", "agent", "when", "message"),
     [
-        ("fo_b1_4tasks", SimpleNamespace(), True, "log_units needs an agent that tells its hidden units by"),
+        ("fo_b1_4tasks", SimpleNamespace(), True, "log_units needs an agent that tells its hidden units, which Simple"),
+        ("fo_b1_4tasks", unknown(), True, "log_units needs an agent that tells its hidden units, which Zeros does not"),
         ("frozen_lake_4maps", Zeros(), True, "log_units needs CT-graphs, whose images are known, got GymTask"),
         ("fo_b1_4tasks", Zeros(), "block", "log_units must be True, False or 'batch', got 'block'"),
     ],
