@@ -12,7 +12,7 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
-from baselines.parts.hooks import Hooks
+from baselines.parts.hooks import Hooks, PlasticityHooks
 from baselines.parts.networks import Encoder, TensorsByName
 from baselines.update.trained import Trained
 from baselines.update.update import MOMENTS, has_parts
@@ -25,7 +25,8 @@ MANY_IDS = 1024
 def only_live_ids(learner: Trained, shown: Tensor) -> Iterator[None]:
     """Learn with the columns of ids that are shown or were; the encoders have all columns before and after.
 
-    On GPUs, compiled, with a method and with another optimiser they keep all columns, as these may change any.
+    On GPUs, compiled, with a method, a plasticity, weight decay or another optimiser they keep all columns, as these
+    may change any.
 
     Args:
         shown: from `baselines.parts.learner.Learner.shown_ids`.
@@ -54,8 +55,9 @@ def only_live_ids(learner: Trained, shown: Tensor) -> Iterator[None]:
 
 def _leaves_others(learner: Trained, shown: Tensor) -> bool:
     """Return whether steps change no weight without a gradient."""
-    is_plain = type(learner.method) is Hooks and learner.compiled_step is None
-    return shown.is_cpu and is_plain and has_parts(learner.optimiser)
+    is_plain = type(learner.method) is Hooks and type(learner.plasticity) is PlasticityHooks
+    decays = any(group["weight_decay"] for group in learner.optimiser.param_groups)
+    return shown.is_cpu and is_plain and learner.compiled_step is None and has_parts(learner.optimiser) and not decays
 
 
 def _encoders(learner: Trained) -> list[Encoder]:

@@ -7,6 +7,7 @@ import torch
 from helpers.small_agents import REPLAY, agent_of, others_slow
 
 from baselines.parts import live_ids
+from baselines.parts.hooks import Hooks, PlasticityHooks
 from baselines.parts.networks import Encoder
 from ctgraph_rl import CTGraphEnv
 from ctgraph_rl.learn.collect import collect
@@ -85,13 +86,17 @@ def test_a_failed_batch_leaves_all_columns(compose, monkeypatch):
     assert agent.trunk.module.linear.weight.shape[1] == 144 + NUM_IDS
 
 
-def test_a_penalty_that_changes_any_weight_keeps_all_columns(compose, monkeypatch):
+@pytest.mark.parametrize("what", ["nothing", "method", "plasticity", "weight decay"])
+def test_what_may_change_any_weight_keeps_all_columns(compose, monkeypatch, what):
     monkeypatch.setattr(live_ids, "MANY_IDS", NUM_IDS)
     env = CTGraphEnv([ONE] * 16, seed=1, task_ids=IDS, num_task_ids=NUM_IDS)
     agent = agent_of(compose, "ppo", env)
+    if what == "method":
+        agent.method = type("Shrink", (Hooks,), {})()
+    elif what == "plasticity":
+        agent.plasticity = type("Shrink", (PlasticityHooks,), {})()
+    elif what == "weight decay":
+        agent.optimiser.param_groups[0]["weight_decay"] = 0.1
 
     with live_ids.only_live_ids(agent, torch.tensor([3])):
-        assert agent.trunk.module.linear.weight.shape[1] == 144 + 1
-    agent.method = type("Shrink", (live_ids.Hooks,), {})()
-    with live_ids.only_live_ids(agent, torch.tensor([3])):
-        assert agent.trunk.module.linear.weight.shape[1] == 144 + NUM_IDS
+        assert agent.trunk.module.linear.weight.shape[1] == 144 + (1 if what == "nothing" else NUM_IDS)
