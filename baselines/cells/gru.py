@@ -30,7 +30,8 @@ class GRU(Cell):
 
     @override
     def input_layers(self) -> list[tuple[Tensor, Tensor]]:
-        return [(self.gru.weight_ih_l0, self.gru.bias_ih_l0)]
+        of_inputs, _, bias, _ = self.gru.all_weights[0]
+        return [(of_inputs, bias)]
 
     @override
     def step(self, inputs: Tensor, state: CellState) -> CellOutput:

@@ -34,7 +34,8 @@ class LSTM(Cell):
 
     @override
     def input_layers(self) -> list[tuple[Tensor, Tensor]]:
-        return [(self.lstm.weight_ih_l0, self.lstm.bias_ih_l0)]
+        of_inputs, _, bias, _ = self.lstm.all_weights[0]
+        return [(of_inputs, bias)]
 
     @override
     def step(self, inputs: Tensor, state: CellState) -> CellOutput:

@@ -1,4 +1,4 @@
-"""``ctgraph-rl methods``: the methods, what each needs to know, and the detectors that find it."""
+"""``ctgraph-rl methods``: the methods, what each needs to know, the detectors that find it, and plasticities."""
 
 from __future__ import annotations
 
@@ -12,11 +12,16 @@ def needs_ids(method: CatalogueEntry) -> str:
 
 
 def main() -> None:
-    """Print a line for every method, and for every detector that gives methods the ids and boundaries they need."""
+    """Print a line for every method, every detector that gives methods the ids and boundaries they need, and every
+    plasticity.
+    """
     config_dir = config_dir_of("methods", main.__doc__)
     print("method=NAME  needs ids    boundaries  what it is")
     for method in catalogue("method", config_dir):
         print(f"{method.name:<12} {needs_ids(method):<12} {method.says('needs_boundaries'):<11} {method.comment}")
+    print("\nplasticity=NAME     what it is")
+    for plasticity in catalogue("plasticity", config_dir):
+        print(f"{plasticity.name:<19} {plasticity.comment}")
     print("\ndetector=NAME  reads                 what it is")
     for detector in catalogue("detector", config_dir):
         print(f"{detector.name:<14} {detector.facts.get('reads', '-'):<21} {detector.comment}")

@@ -23,7 +23,8 @@ class SI(Importance):
     """Adds c * sum_i O_i (w_i - a_i)^2, O_i = sum over tasks of max(0, v_i) / (d_i^2 + xi).
 
     v_i is the sum over gradient steps of -(d loss / d w_i) times the change of w_i, with the gradient of the agent's
-    own losses; d_i is the change of w_i over the task; a are the weights at the end of the last task.
+    own losses and a plasticity's; d_i is the change of w_i in these steps over the task; a are the weights at the end
+    of the last task.
 
     Beside those of `Importance`, v, the weights at the task's start and two vectors of a step are stored: 28 P bytes in
     all.

@@ -129,8 +129,9 @@ class Encoder(nn.Module):
             found.append(Units("convolution.1", self.convolutions.first, self.convolutions.first_relu))
             found.append(Units("convolution.2", self.convolutions.second, self.convolutions.second_relu))
         found.append(Units("encoder.1", self.linear, self.relu))
-        for number in range(0, len(self.further), 2):
-            found.append(Units(f"encoder.{number // 2 + 2}", self.further[number], self.further[number + 1]))
+        for number, layer in enumerate(self.further):
+            if isinstance(layer, nn.Linear):
+                found.append(Units(f"encoder.{number // 2 + 2}", layer, self.further[number + 1]))
         return found
 
     def forward(self, observation: Tensor, *extra: Tensor) -> Tensor:

@@ -32,11 +32,11 @@ class HiddenLayer(NamedTuple):
     """A layer of units with all that reads them: heads of actor and critic both, the gates of a cell."""
 
     name: str
-    linear: nn.Linear | None
-    """Incoming weights, [units, inputs], and biases; None for the state of a cell, which no ReLU writes."""
+    linear: Any
+    """The `torch.nn.Linear` of incoming weights and biases; None for the state of a cell, which no ReLU writes."""
 
-    activation: nn.Module | None
-    """What writes the units, [..., units]; None likewise."""
+    activation: Any
+    """The module that writes the units, [..., units]; None likewise."""
 
     readers: list[Reader]
 
@@ -137,9 +137,9 @@ def _heads(policy: nn.Module, trunk: Any) -> list[nn.Module]:
     """Return the modules that read a trunk's outputs."""
     found: list[nn.Module] = []
     for part in policy.modules():
-        is_single = isinstance(part, TensorDictModule) and not isinstance(part, TensorDictSequential)
-        if is_single and trunk.out_keys[0] in part.in_keys and isinstance(part.module, nn.Module):
-            found.append(part.module)
+        if isinstance(part, TensorDictModule) and not isinstance(part, TensorDictSequential):
+            reads = trunk.out_keys[0] in part.in_keys
+            found += [part.module] * (reads and isinstance(part.module, nn.Module))
     return found
 
 

@@ -30,7 +30,7 @@ class CChain(Plasticity):
 
     D is the mean of KL(p', p) of a policy p, or of (q - q')^2 of action values q. p' and q' are by the weights of some
     gradient steps ago. c is ``coeff`` at first. After ``window`` gradient steps, c = max(0, target * L / D), with the
-    means of the last ``window`` for D and the policy's or the values' loss L.
+    means of the last ``window`` for D and L, the agent's first loss: the policy's, or that of action values.
 
     Args:
         coeff: c at first, >= 0.
@@ -65,9 +65,9 @@ class CChain(Plasticity):
 
     @override
     def setup(self, agent: Learner) -> None:
-        known = isinstance(agent, (PolicyGradient, QLearner))
-        rule = f"CChain holds a policy or action values, and {type(agent).__name__} has other losses"
-        require((known, f"{rule}: take agent=ppo or dqn"))
+        known = isinstance(agent, (PolicyGradient, QLearner)) and bool(self.layers)
+        rule = f"CChain needs the outputs at any frames, which {type(agent).__name__} does not give"
+        require((known, f"{rule}: take agent=ppo, lstm_ppo or dqn"))
         self.is_policy = isinstance(agent, PolicyGradient)
         names = {id(parameter): name for name, parameter in agent.named_parameters()}
         self.names = [names[id(parameter)] for parameter in agent.trainable]
@@ -125,7 +125,7 @@ class CChain(Plasticity):
 
     @override
     def after_step(self, batch: Data, measured: TensorsByName) -> TensorsByName:
-        loss = measured["loss_objective" if self.is_policy else "loss_value"]
+        loss = next(value for key, value in measured.items() if key.startswith("loss_"))
         used = measured["grad_norm"].new_tensor(self.present_coeff)
         self.recent[self.num_steps % self.window] = torch.stack([loss, measured["churn"]]).to(self.recent)
         self.num_steps += 1

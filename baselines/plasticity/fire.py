@@ -56,7 +56,8 @@ def isometry(matrix: Tensor, iterations: int | None = None) -> Tensor:
         u, _, v = torch.linalg.svd(matrix, full_matrices=False)
         return scale * (u @ v)
     is_wide = matrix.shape[1] > matrix.shape[0]
-    x = (matrix.mT if is_wide else matrix) / torch.linalg.matrix_norm(matrix)
+    size = torch.linalg.matrix_norm(matrix).clamp(min=torch.finfo(matrix.dtype).tiny)  # one that failed is 0
+    x = (matrix.mT if is_wide else matrix) / size
     for _ in range(iterations):
         x = 1.5 * x - 0.5 * x @ (x.mT @ x)
     return scale * (x.mT if is_wide else x)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -53,7 +53,7 @@ class Plasticity(TakesNumbers, PlasticityHooks):
             ValueError: if agent, plasticity and curriculum do not fit together.
         """
         name = type(self).__name__
-        kind = type(agent)
+        kind: Any = type(agent)
         usual = isinstance(agent, Learner) and kind.gradient_step is Learner.gradient_step
         require(
             (usual, f"{name} needs an agent with the gradient steps of Learner, not {kind.__name__}: take agent=ppo"),
@@ -109,7 +109,7 @@ class Plasticity(TakesNumbers, PlasticityHooks):
             yield
         self.agent.method.weights_rewritten(flat(self.agent.weights).detach() - before)
 
-    def clear_moments(self, parameter: Tensor, index: object = ...) -> None:
+    def clear_moments(self, parameter: Tensor, index: Any = ...) -> None:
         """Set a parameter's moments to zero, all or at an index; the optimiser's count of its steps stays."""
         for value in self.agent.optimiser.state.get(parameter, {}).values():
             if value.shape == parameter.shape:

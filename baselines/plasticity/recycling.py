@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -40,15 +41,19 @@ class Recycling(Plasticity):
         count = int(torch.cat(list(chosen)).sum())
         if count:
             with self.rewriting():
-                for number, (layer, units) in enumerate(zip(self.layers, chosen, strict=True)):
-                    for reader in layer.readers if means is not None else ():
-                        moved = reader.weight[:, reader.columns[units]] * means[number][units].unsqueeze(-1)
-                        reader.bias.add_(moved.sum(dim=(1, 2)))
+                if means is not None:
+                    self._move_on(chosen, means)
                 self._renew(chosen)
                 for layer, units in zip(self.layers, chosen, strict=True):
                     for reader in layer.readers:
                         self._set(reader.weight, (slice(None), reader.columns[units].flatten()), 0.0)
         return count
+
+    def _move_on(self, chosen: Sequence[Tensor], means: Sequence[Tensor]) -> None:
+        for layer, units, mean in zip(self.layers, chosen, means, strict=True):
+            for reader in layer.readers:
+                moved = reader.weight[:, reader.columns[units]] * mean[units].unsqueeze(-1)
+                reader.bias.add_(moved.sum(dim=(1, 2)))
 
     def _renew(self, chosen: Sequence[Tensor]) -> None:
         drawn = self.draw_weights()
@@ -59,7 +64,7 @@ class Recycling(Plasticity):
                 self._set(layer.norm.weight, units, 1.0)
                 self._set(layer.norm.bias, units, 0.0)
 
-    def _set(self, parameter: Tensor, index: object, value: Tensor | float) -> None:
+    def _set(self, parameter: Tensor, index: Any, value: Tensor | float) -> None:
         parameter[index] = value
         if self.reset_moments:
             self.clear_moments(parameter, index)

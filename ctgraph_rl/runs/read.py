@@ -497,7 +497,9 @@ def _agent_names(runs: Sequence[Run]) -> list[str]:
     for run in runs:
         parts = [_name(run)]
         for key in differing[_kind(run)]:
-            parts.append(f"{key.removeprefix('agent.').removeprefix('method.')}={run.settings.get(key)}")
+            parts.append(
+                f"{key.removeprefix('agent.').removeprefix('method.').removeprefix('plasticity.')}={run.settings.get(key)}"
+            )
         code = code_of(run, twins[run.alike])
         names.append(" ".join([*parts, f"({code})"] if code else parts))
     return names
