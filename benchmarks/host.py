@@ -1,0 +1,150 @@
+"""What the host does for many seeds as one batch, beside learning: python -m benchmarks.host.
+
+Seeds of LSTM-PPO go through four tasks as a job with ``together=true`` does, with a learner that costs nothing, as on a
+fast device: actions are 0 and no weight changes. Each part is one line: milliseconds of a seed each time, how often a
+seed of the main job (4 x 204,800 frames) needs it, and seconds of all seeds. Time is the process's CPU time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
+from functools import wraps
+from io import StringIO
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+from unittest.mock import patch
+
+import hydra
+import torch
+from tensordict import TensorDictBase
+
+from baselines.parts.policy_gradient import PolicyGradient
+from baselines.update.stack import Stack
+from ctgraph_rl.checks import at_least_one, require
+from ctgraph_rl.learn import loop
+from ctgraph_rl.log.escape import markdown_table
+from ctgraph_rl.packages import conf_dir
+from ctgraph_rl.runs import config, job, session
+
+SMALL = ("agent.num_envs=32", "curriculum.num_frames=1024", "together=true", "checkpoint_seconds=1e9")
+"""One batch a block; the host's work does not depend on its size but for `log`."""
+
+PARTS = {
+    "build": ([(job, "build"), (job, "prepare")], 1, 1),
+    "begin": ([(session.RunMember, "begin")], 1, 1),
+    "weights to the agents": ([(Stack, "write")], 4, 100),
+    "log": ([(loop, "log_training")], 4, 100),
+    "evaluate": ([(loop.Lockstep, "_evaluate")], 5, 5),
+    "checkpoint": ([(session, "offer_all")], 4, 4),
+    "finish": ([(session.RunMember, "finish")], 1, 1),
+}
+"""The functions of each part, and how often a seed needs it here and in the main job."""
+
+
+class Costless:
+    """A `ctgraph_rl.learn.loop.Group` of agents that take action 0 and learn nothing.
+
+    Their weights are written after each batch, as after those of a device.
+    """
+
+    device_generators = None
+
+    def __init__(self, agents: Sequence[PolicyGradient], generators: Sequence[torch.Generator]) -> None:
+        self.agents = list(agents)
+        self.generators = list(generators)
+        self.stack = Stack(self.agents)
+        self.measured = dict.fromkeys(("loss_objective", "loss_critic", "loss_entropy", "grad_norm"), 0.5)
+
+    def policy(self, data: TensorDictBase) -> TensorDictBase:
+        """Write action 0, and the recurrent state unchanged."""
+        for key in list(data.keys()):
+            if key.startswith("recurrent_state"):
+                data["next", key] = data[key]
+        return data.set("action", torch.zeros(len(data), dtype=torch.int64, device="cpu"))
+
+    def start_task(self, task: int | None = None) -> None:
+        """Nothing."""
+
+    def end_task(self) -> None:
+        """Nothing."""
+
+    def learn(self, batch: TensorDictBase) -> list[loop.Learnt]:
+        """Write the weights to the agents."""
+        self.stack.write()
+        return [dict(self.measured) for _ in self.agents]
+
+
+class Timer:
+    """CPU seconds of functions by part."""
+
+    def __init__(self) -> None:
+        self.seconds = dict.fromkeys(PARTS, 0.0)
+
+    def timed(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a function that adds its time to a part."""
+
+        @wraps(function)
+        def measured(*given: Any, **named: Any) -> Any:
+            start = time.process_time()
+            try:
+                return function(*given, **named)
+            finally:
+                self.seconds[part] += time.process_time() - start
+
+        return measured
+
+
+@contextmanager
+def measured_parts() -> Iterator[Timer]:
+    """Measure the parts of a group's job, with a learner that costs nothing."""
+    timer = Timer()
+    with ExitStack() as stack:
+        for part, (functions, _, _) in PARTS.items():
+            for owner, name in functions:
+                stack.enter_context(patch.object(owner, name, timer.timed(part, getattr(owner, name))))
+        stack.enter_context(patch.object(session, "agents_together", lambda agents, draws, _: Costless(agents, draws)))
+        stack.enter_context(patch.object(config, "in_sweep", lambda: True))
+        yield timer
+
+
+def run(num_seeds: int) -> Timer:
+    """Run a group of seeds in a temporary folder."""
+    with TemporaryDirectory() as folder, hydra.initialize_config_dir(conf_dir(), version_base="1.3"):
+        cells = []
+        for seed in range(num_seeds):
+            cfg = hydra.compose("config", overrides=["agent=lstm_ppo", *SMALL, f"seed={seed}"])
+            run_dir = Path(folder, str(seed))
+            run_dir.mkdir()
+            cells.append((cfg, run_dir))
+        with measured_parts() as timer, redirect_stdout(StringIO()), redirect_stderr(StringIO()):
+            job.run_as_one(cells)
+    return timer
+
+
+def table(timer: Timer, num_seeds: int) -> str:
+    """Return the parts as a table in Markdown."""
+    rows = []
+    total = 0.0
+    for part, (_, here, times) in PARTS.items():
+        once = timer.seconds[part] / here
+        total += once * times
+        rows.append([part, f"{1e3 * once / num_seeds:.2f}", str(times), f"{once * times:.1f}"])
+    rows.append(["all", f"{1e3 * total / num_seeds:.2f}", "", f"{total:.1f}"])
+    return markdown_table(["part", "ms a seed", "times", f"s of {num_seeds:,} seeds"], rows)
+
+
+def main() -> None:
+    """Measure and print the table."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.host", description=__doc__.partition("\n")[0])
+    parser.add_argument("--seeds", type=int, default=128, help="seeds of the group; default: 128")
+    arguments = parser.parse_args()
+    require(*at_least_one(seeds=arguments.seeds))
+    print(table(run(arguments.seeds), arguments.seeds))
+
+
+if __name__ == "__main__":
+    main()
