@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
 from functools import wraps
 from io import StringIO
@@ -22,7 +22,8 @@ import hydra
 import torch
 from tensordict import TensorDictBase
 
-from baselines.parts.policy_gradient import PolicyGradient
+from baselines.parts.networks import Items
+from baselines.update.captured import CapturedGroup
 from baselines.update.stack import Stack
 from ctgraph_rl.checks import at_least_one, require
 from ctgraph_rl.learn import loop
@@ -36,7 +37,7 @@ SMALL = ("agent.num_envs=32", "curriculum.num_frames=1024", "together=true", "ch
 PARTS = {
     "build": ([(job, "build"), (job, "prepare")], 1, 1),
     "begin": ([(session.RunMember, "begin")], 1, 1),
-    "weights to the agents": ([(Stack, "write")], 4, 100),
+    "weights to the agents": ([(Stack, "write")], 5, 5),
     "log": ([(loop, "log_training")], 4, 100),
     "evaluate": ([(loop.Lockstep, "_evaluate")], 5, 5),
     "checkpoint": ([(session, "offer_all")], 4, 4),
@@ -45,55 +46,45 @@ PARTS = {
 """The functions of each part, and how often a seed needs it here and in the main job."""
 
 
-class Costless:
-    """A `ctgraph_rl.learn.loop.Group` of agents that take action 0 and learn nothing.
+class Costless(CapturedGroup):
+    """Agents that take action 0 and measure constants: no operation of a device is counted."""
 
-    Their weights are written after each batch, as after those of a device.
-    """
-
-    device_generators = None
-
-    def __init__(self, agents: Sequence[PolicyGradient], generators: Sequence[torch.Generator]) -> None:
-        self.agents = list(agents)
-        self.generators = list(generators)
-        self.stack = Stack(self.agents)
-        self.measured = dict.fromkeys(("loss_objective", "loss_critic", "loss_entropy", "grad_norm"), 0.5)
-
-    def policy(self, data: TensorDictBase) -> TensorDictBase:
-        """Write action 0, and the recurrent state unchanged."""
-        for key in list(data.keys()):
+    def acted(self, data: TensorDictBase, greedy: bool = False) -> Items:
+        """Return action 0, and the recurrent state unchanged."""
+        written: Items = {"action": torch.zeros(len(self.learners), len(data) // len(self.learners), dtype=torch.int64)}
+        for key in data.keys():  # noqa: SIM118, rows otherwise
             if key.startswith("recurrent_state"):
-                data["next", key] = data[key]
-        return data.set("action", torch.zeros(len(data), dtype=torch.int64, device="cpu"))
+                written["next", key] = self.by_seed(data[key])
+        return written
 
-    def start_task(self, task: int | None = None) -> None:
-        """Nothing."""
-
-    def end_task(self) -> None:
-        """Nothing."""
-
-    def learn(self, batch: TensorDictBase) -> list[loop.Learnt]:
-        """Write the weights to the agents."""
-        self.stack.write()
-        return [dict(self.measured) for _ in self.agents]
+    def learnt(self, batch: TensorDictBase) -> list[loop.Learnt]:
+        """Return what PPO measures; the agents' weights count as learned."""
+        self._is_behind = True
+        names = ("loss_objective", "loss_critic", "loss_entropy", "grad_norm")
+        return [dict.fromkeys(names, 0.123456789) for _ in self.learners]
 
 
 class Timer:
-    """CPU seconds of functions by part."""
+    """CPU seconds of functions by part; what one part calls of another counts as its own."""
 
     def __init__(self) -> None:
         self.seconds = dict.fromkeys(PARTS, 0.0)
+        self.is_within = False
 
     def timed(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
         """Return a function that adds its time to a part."""
 
         @wraps(function)
         def measured(*given: Any, **named: Any) -> Any:
+            if self.is_within:
+                return function(*given, **named)
+            self.is_within = True
             start = time.process_time()
             try:
                 return function(*given, **named)
             finally:
                 self.seconds[part] += time.process_time() - start
+                self.is_within = False
 
         return measured
 

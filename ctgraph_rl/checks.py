@@ -345,6 +345,8 @@ def require_all(kind: type[T], name: str, values: object) -> tuple[T, ...]:
     Raises:
         ValueError: for anything else.
     """
+    if isinstance(values, (list, tuple)) and values and all(isinstance(value, kind) for value in values):
+        return tuple(values)
     items = as_tuple(values)
     holds = isinstance(items, tuple) and len(items) > 0 and all(isinstance(item, kind) for item in items)
     kinds = sorted({type(item).__name__ for item in items}) if isinstance(items, tuple) else [type(values).__name__]

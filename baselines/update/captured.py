@@ -1,7 +1,7 @@
 """Several seeds as one batch on a GPU: all act by one CUDA graph, and take a gradient step by another.
 
-The number of operations does not grow with the seeds. Weights stay stacked between batches, and agents get theirs after
-each. Each seed draws by counter.
+The number of operations does not grow with the seeds. Weights stay stacked between batches, and agents get theirs when
+they are asked for. Each seed draws by counter.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from baselines.parts.learner import Learner
 from baselines.parts.networks import Data, Items, TensorsByName
 from baselines.parts.policy_gradient import PolicyGradient, Seeds
 from baselines.update.measured import finite_means, table_of
-from baselines.update.seeds import SeedGroup, has_stackable, learner_of, or_error, sampled, why_not_step
+from baselines.update.seeds import SeedGroup, has_stackable, learner_of, or_error, sampled, why_not_step, write_rows
 from baselines.update.stack import Stack
 from baselines.update.update import update
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.core import philox
 from ctgraph_rl.core.region import Region
-from ctgraph_rl.learn.collect import PREVIOUS_ACTION
+from ctgraph_rl.learn.collect import PREVIOUS_ACTION, Policy
 from ctgraph_rl.learn.loop import Learnt
 
 SHARED = ("learn", "gradient_step", "minibatches", "after_update", "one_step", "reward", "advantages")
@@ -110,13 +110,25 @@ class CapturedGroup(SeedGroup):
 
     def __init__(self, agents: Sequence[PolicyGradient], generators: Sequence[torch.Generator]) -> None:
         super().__init__(agents, generators)
-        self.most_at_once = len(self.agents)
+        self.most_at_once = len(self.learners)
+        self._is_behind = False  # whether the agents lack weights of the stack
         device = next(self.first.parameters()).device
         self.draws = Draws([generator.initial_seed() for generator in generators], device)
         self.device_generators = [SeedDraws(tick) for tick in self.draws.tick]
         self._region = Region(self._usual_update)
         self._words: list[int] = []
         """A seed of torch's generators for each agent, from which methods draw at boundaries."""
+
+    @property
+    @override
+    def agents(self) -> Sequence[Agent]:
+        self._write_weights()
+        return self._agents
+
+    def _write_weights(self) -> None:
+        if self._is_behind:
+            self.stack.write()
+            self._is_behind = False
 
     @property
     def stack(self) -> Stack:
@@ -159,13 +171,24 @@ class CapturedGroup(SeedGroup):
 
     policy.capturable = True  # type: ignore[attr-defined]
 
+    @property
+    def greedy_policy(self) -> Policy | None:
+        """Acts as `policy`, with the most likely actions; None with a method, whose policy depends on the task."""
+        return None if self.methods else self._act_greedily
+
+    def _act_greedily(self, data: TensorDictBase) -> TensorDictBase:
+        return write_rows(data, self.acted(data, greedy=True))
+
     @override
-    def acted(self, data: TensorDictBase) -> Items:
+    def acted(self, data: TensorDictBase, greedy: bool = False) -> Items:
         keys = self.first.trunk.in_keys
         written = self.stack.one_step({key: self.by_seed(data[key]) for key in keys})
         log_probs = written.pop("log_probs")
-        noise = self.draws.exponential(log_probs[0].numel()).view_as(log_probs)
-        written |= sampled({"log_probs": log_probs, "state_value": written["state_value"]}, noise)
+        if greedy:
+            written["action"] = log_probs.argmax(dim=-1)
+        else:
+            noise = self.draws.exponential(log_probs[0].numel()).view_as(log_probs)
+            written |= sampled({"log_probs": log_probs, "state_value": written["state_value"]}, noise)
         if PREVIOUS_ACTION in keys:
             written["next", PREVIOUS_ACTION] = written["action"]
         return written
@@ -180,12 +203,11 @@ class CapturedGroup(SeedGroup):
     @override
     def learnt(self, batch: TensorDictBase) -> list[Learnt]:
         """The host waits twice."""
-        for method, part in zip(self.methods, batch.chunk(len(self.agents)), strict=False):
+        for method, part in zip(self.methods, batch.chunk(len(self.learners)), strict=False):
             method.on_batch(part)
         steps = []
         for minibatch in self.first.minibatches_of(batch, self.seeds):
             steps.append(self.first.after_update(self.gradient_step(self._transformed(minibatch))))
-        self.stack.write()
         columns = table_of(steps).cpu().unbind(2)
         weights = [self.stack.kept[name].detach().flatten(1) for name in self.stack.learned]
         largest = torch.stack([each.abs().amax(dim=1) for each in weights]).amax(dim=0).cpu()
@@ -194,12 +216,16 @@ class CapturedGroup(SeedGroup):
         def measured(learner: Learner, column: Tensor, largest_weight: Tensor) -> dict[str, float]:
             return learner.after_batch(finite_means(names, column, largest_weight))
 
-        return [or_error(measured, *each) for each in zip(self.learners, columns, largest, strict=True)]
+        found = [or_error(measured, *each) for each in zip(self.learners, columns, largest, strict=True)]
+        self._is_behind = True
+        if self.methods or any(isinstance(each, FloatingPointError) for each in found):
+            self._write_weights()  # methods read them, and those of a failed agent are cleared
+        return found
 
     @property
     def seeds(self) -> Seeds:
         """What the minibatches of all agents are made with."""
-        return Seeds(len(self.agents), self._values, self.draws.orders)
+        return Seeds(len(self.learners), self._values, self.draws.orders)
 
     def _values(self, data: Items) -> Tensor:
         written = self.stack.one_step({key: self.by_seed(value) for key, value in data.items()})

@@ -26,6 +26,7 @@ from baselines.update.measured import table_of
 from baselines.update.stack import Stack
 from baselines.update.update import has_parts, update
 from ctgraph_rl.agent import Agent
+from ctgraph_rl.learn.collect import Policy
 from ctgraph_rl.learn.loop import Learnt
 
 HOOKS = ("on_batch", "transform_minibatch", "penalties", "transform_gradients", "after_step", "after_learning")
@@ -73,19 +74,25 @@ class SeedGroup:
     """
 
     device_generators: Sequence[Any] | None = None
+    greedy_policy: Policy | None = None
 
     def __init__(self, agents: Sequence[Agent], generators: Sequence[torch.Generator]) -> None:
-        self.agents = list(agents)
+        self._agents = list(agents)
         self.generators = list(generators)
         self.learners = [learner_of(agent) for agent in agents]
         self.methods = [agent.method for agent in agents if isinstance(agent, AgentWithMethod)]
         self.first = self.learners[0]
         self.is_stacked = _gains_from_stacking(self.first) and self.first.plasticity.stackable
-        self.most_at_once = _most_at_once(self.first) if self.first.compiled_step else len(self.agents)
+        self.most_at_once = _most_at_once(self.first) if self.first.compiled_step else len(self.learners)
         self._compiled: dict[str, Outputs] = {}
         self._stacks: list[Stack] = []
         self._acting: Stack | None = None
         self._outputs: Outputs | None = None
+
+    @property
+    def agents(self) -> Sequence[Agent]:
+        """The agents as they are after the last batch."""
+        return self._agents
 
     def _task_has_changed(self) -> None:
         """Forget what depends on the task, as methods' computations can."""
@@ -129,13 +136,11 @@ class SeedGroup:
 
     def by_seed(self, value: Tensor) -> Tensor:
         """Return a tensor of all rows, [seeds * rows, ...], as [seeds, rows, ...]."""
-        return value.unflatten(0, (len(self.agents), -1))
+        return value.unflatten(0, (len(self.learners), -1))
 
     def policy(self, data: TensorDictBase) -> TensorDictBase:
         """Write the actions of all agents, [seeds * num_envs], and what learning needs of them."""
-        for key, value in self.acted(data).items():
-            data.set(key, value.flatten(0, 1))
-        return data
+        return write_rows(data, self.acted(data))
 
     def acted(self, data: TensorDictBase) -> Items:
         """Return what the policies write, [seeds, num_envs, ...] each."""
@@ -200,7 +205,7 @@ class SeedGroup:
 
     def learnt(self, batch: TensorDictBase) -> list[Learnt]:
         """Learn as `learn` does; an agent that failed keeps weights that are not finite."""
-        parts = batch.chunk(len(self.agents))
+        parts = batch.chunk(len(self.learners))
         measured: list[Learnt] = []
         if not self.is_stacked:
             for number, (agent, part) in enumerate(zip(self.agents, parts, strict=True)):
@@ -331,6 +336,13 @@ def sampled(outputs: Mapping[str, Tensor], noise: Tensor) -> TensorsByName:
     action = (log_probs.softmax(dim=-1) / noise).argmax(dim=-1)
     of_action = log_probs.gather(-1, action.unsqueeze(-1)).squeeze(-1)
     return {"action": action, "action_log_prob": of_action, "state_value": outputs["state_value"]}
+
+
+def write_rows(data: TensorDictBase, written: Items) -> TensorDictBase:
+    """Write what policies wrote, [seeds, rows, ...] each, into the data of all rows."""
+    for key, value in written.items():
+        data.set(key, value.flatten(0, 1))
+    return data
 
 
 def learner_of(agent: Agent) -> Any:

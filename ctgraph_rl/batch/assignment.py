@@ -48,10 +48,12 @@ def find_numbers(pool: Sequence[Task], tasks: Iterable[Task]) -> list[int]:
     if isinstance(pool, DrawnTasks):
         drawn = {task: pool.index(task) for task in dict.fromkeys(tasks)}
         return [drawn[task] for task in tasks]
+    objects = {id(task): task for task in tasks}  # few, and a task's hash takes longer than its identity
     number = {task: i for i, task in enumerate(pool)}
-    unknown = [task for task in dict.fromkeys(tasks) if task not in number]
+    unknown = [task for task in dict.fromkeys(objects.values()) if task not in number]
     require((not unknown, f"tasks must be in task_pool, got {unknown[:3]}; name them at construction"))
-    return [number[task] for task in tasks]
+    numbers = {identity: number[task] for identity, task in objects.items()}
+    return [numbers[id(task)] for task in tasks]
 
 
 def find_leaves(tasks: Sequence[Task], goals: Iterable[Goal]) -> list[int]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -187,11 +187,7 @@ def act(env: EnvBase, policy: Policy, data: Step, start: Step) -> tuple[Step, St
     A policy whose class defines ``act_on_tensors`` gets a plain dict instead of a TensorDict, which is faster. Derived
     classes, modules around it and hooks are called.
     """
-    if _acts_on_tensors(policy):
-        data = data | policy.act_on_tensors(data)  # type: ignore[attr-defined]
-    else:
-        data = dict(policy(TensorDict(data, env.batch_size, device=env.device)).items(True, True))
-    step, following = take_step(env, data)
+    step, following = take_step(env, acted(policy, data, env.device))
     for key, value in start.items():
         state = step["next", key]
         begins = beside(following["is_init"], value)
@@ -199,9 +195,18 @@ def act(env: EnvBase, policy: Policy, data: Step, start: Step) -> tuple[Step, St
     return step, following
 
 
+def acted(policy: Policy, data: Step, device: torch.device | None) -> Step:
+    """Return the data of some rows with what a policy writes, as `act`."""
+    if _acts_on_tensors(policy):
+        return data | policy.act_on_tensors(data)  # type: ignore[attr-defined]
+    return dict(policy(TensorDict(data, [len(data["observation"])], device=device)).items(True, True))
+
+
 def _acts_on_tensors(policy: Policy) -> bool:
     if "act_on_tensors" not in vars(type(policy)):
         return False
+    if not isinstance(policy, nn.Module):
+        return True
     return not (policy._forward_hooks or policy._forward_pre_hooks or policy._compiled_call_impl)  # type: ignore[attr-defined]
 
 

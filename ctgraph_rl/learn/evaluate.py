@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -20,7 +20,7 @@ from ctgraph_rl.checks import NamedValues, require, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL
 from ctgraph_rl.env import CTGraphEnv
-from ctgraph_rl.learn.collect import ENDS, InitialState, Policy, act, agent_specs, make_env, make_start
+from ctgraph_rl.learn.collect import ENDS, InitialState, Policy, Step, act, acted, agent_specs, make_env, make_start
 from ctgraph_rl.learn.exact import exact_measures, shown_id
 from ctgraph_rl.learn.labels import task_labels
 from ctgraph_rl.learn.logits_policy import as_policy
@@ -146,14 +146,26 @@ def episode_means(ends: TensorDictBase) -> NamedValues:
     Args:
         ends: data of the last step of each episode.
     """
+    return means_by_part(ends, [ends.batch_size[0]])[0]
+
+
+def means_by_part(ends: TensorDictBase, counts: Sequence[int]) -> list[NamedValues]:
+    """Return `episode_means` of successive parts of some sizes, with one transfer of each key from a device."""
     outcome = ends.get("outcome", None)
-    return {
-        "episodes": ends.batch_size[0],
-        "return_mean": ends["episode_reward"].double().mean().item(),
-        "success_rate": math.nan if outcome is None else (outcome == OUTCOME_GOAL).double().mean().item(),
-        "end_rate": math.nan if outcome is None else (outcome != OUTCOME_FAIL).double().mean().item(),
-        "length_mean": ends["step_count"].double().mean().item(),
+    values = {
+        "return_mean": ends["episode_reward"],
+        "success_rate": None if outcome is None else outcome == OUTCOME_GOAL,
+        "end_rate": None if outcome is None else outcome != OUTCOME_FAIL,
+        "length_mean": ends["step_count"],
     }
+    found: list[NamedValues] = [{"episodes": count} for count in counts]
+    for name, value in values.items():
+        means = [math.nan] * len(counts)
+        if value is not None:
+            means = torch.stack([part.mean() for part in value.cpu().double().split([*counts])]).tolist()
+        for part, mean in zip(found, means, strict=True):
+            part[name] = mean
+    return found
 
 
 def adaptation(rows: TensorDictBase, task: TaskLike) -> Iterator[NamedValues]:
@@ -205,6 +217,16 @@ class Evaluator:
         self.log = log
         self.device = device
         self.untrained = untrained
+        self._shared: tuple[object, EnvBase] | None = None
+
+    def make_shared_env(self, tasks: Iterable[TaskLike], count: int) -> EnvBase:
+        """Return an environment of as many members; it is kept for the next evaluation."""
+        rows: list[TaskLike] = []
+        for task in tasks:
+            rows += [task] * self.num_rows
+        if self._shared is None or self._shared[0] != (rows, count):
+            self._shared = (rows, count), make_env(self.curriculum, rows * count, self.seed, self.device)
+        return self._shared[1]
 
     def evaluate_if_due(self, agent: Agent, frames: int) -> None:
         """Evaluate an agent if the curriculum evaluates after ``frames`` frames of the run."""
@@ -230,11 +252,10 @@ class Evaluator:
         if how.exact:
             self._measure([policy] * len(tasks), frames, moment, initial_state)
             return
-        num_rows = how.num_episodes // how.episodes_per_row
         result = evaluate(
             policy,
             list(tasks),
-            num_rows * how.row_episodes,
+            self.num_rows * how.row_episodes,
             seed=derive_seed(self.seed, "evaluation", frames),
             greedy=how.greedy,
             episodes_per_row=how.row_episodes,
@@ -242,12 +263,13 @@ class Evaluator:
             device=self.device,
             curriculum=curriculum,
         )
-        for (task, named), episodes in zip(tasks.items(), result, strict=True):
-            append = self._append(named, frames, moment)
-            rows = episodes.view(num_rows, how.row_episodes)
-            append("evaluation", **episode_means(rows[:, how.adapt_episodes :].reshape(-1)))
-            for measured in adaptation(rows, task) if how.adapt_episodes else ():
-                append("adaptation", **measured)
+        log_evaluation([self], result, frames, moment)
+
+    @property
+    def num_rows(self) -> int:
+        """Rows that play a task."""
+        how = self.curriculum.evaluation
+        return how.num_episodes // how.episodes_per_row
 
     def _measure(
         self, policies: Sequence[Policy], frames: int, moment: str, initial_state: InitialState | None
@@ -288,6 +310,104 @@ class Evaluator:
     def tasks_at(self, frames: int) -> dict[TaskLike, tuple[int, str]]:
         """Return the tasks to evaluate after ``frames`` frames, with their numbers and labels."""
         return self.curriculum.evaluated(frames)
+
+
+def log_evaluation(evaluators: Sequence[Evaluator], result: TensorDictBase, frames: int, moment: str) -> None:
+    """Append the lines of an evaluation of members.
+
+    Args:
+        result: data of the last step of each episode; those of a row, the rows of a task, the tasks of a member and
+            the members are adjacent.
+    """
+    first = evaluators[0]
+    how = first.curriculum.evaluation
+    tasks = first.tasks_at(frames)
+    rows = result.reshape(-1, how.row_episodes)
+    counts = [how.num_episodes] * (len(evaluators) * len(tasks))
+    measured = iter(means_by_part(rows[:, how.adapt_episodes :].reshape(-1), counts))
+    of_task = iter(rows.split(first.num_rows))
+    for evaluator in evaluators:
+        for task, named in tasks.items():
+            append = evaluator._append(named, frames, moment)
+            append("evaluation", **next(measured))
+            for step in adaptation(next(of_task), task) if how.adapt_episodes else ():
+                append("adaptation", **step)
+
+
+ROWS_AT_ONCE = 2**18
+"""Most rows of members that are evaluated together and act in turn."""
+
+
+@torch.no_grad()
+def evaluate_together(
+    evaluators: Sequence[Evaluator],
+    agents: Sequence[Agent],
+    frames: int,
+    moment: str,
+    policy: Policy | None = None,
+    logged: Collection[int] | None = None,
+) -> None:
+    """Evaluate members of one curriculum of CT-graphs as each does alone, in one environment.
+
+    Args:
+        agents: of each member.
+        policy: acts for all members, each with as many adjacent rows, and greedily; None: each acts in turn.
+        logged: positions of those whose lines are appended; None: all.
+    """
+    first = evaluators[0]
+    curriculum = first.curriculum
+    tasks = first.tasks_at(frames)
+    how = curriculum.evaluation
+    count = len(tasks) * first.num_rows
+    most = len(evaluators) if policy is not None else max(1, ROWS_AT_ONCE // max(1, count))
+    if len(evaluators) > most:
+        for start in range(0, len(evaluators), most):
+            some = slice(start, start + most)
+            evaluate_together(evaluators[some], agents[some], frames, moment)
+        return
+    if not tasks:
+        return
+    seeds = [derive_seed(each.seed, "evaluation", frames) for each in evaluators]
+    if policy is None:
+        policies = []
+        for evaluator, agent in zip(evaluators, agents, strict=True):
+            own = task_policies(agent, curriculum, evaluator.log, tasks, frames)
+            policies.append(_join_policies(agent, own))
+        policy = InTurn(policies, seeds)
+    env = first.make_shared_env(tasks, len(evaluators))
+    streams = torch.tensor(seeds, device=env.device).repeat_interleave(count)
+    env.rows.set_streams(streams, torch.arange(count, device=env.device).repeat(len(evaluators)))
+    exploration = ExplorationType.DETERMINISTIC if how.greedy else ExplorationType.RANDOM
+    with torch.random.fork_rng(devices=[]), set_exploration_type(exploration):
+        result = _first_episodes(env, policy, agents[0].initial_state, how.row_episodes)
+    if logged is not None:
+        result = result.view(len(evaluators), -1)[[*logged]]
+        evaluators = [evaluators[number] for number in logged]
+    log_evaluation(evaluators, result, frames, moment)
+
+
+class InTurn:
+    """A policy of equal slices of rows, which draw from generators of their own.
+
+    Args:
+        policies: of each slice.
+        seeds: of each generator.
+    """
+
+    def __init__(self, policies: Sequence[Policy], seeds: Sequence[int]) -> None:
+        self.policies = policies
+        self.states = [torch.Generator(device="cpu").manual_seed(seed).get_state() for seed in seeds]
+
+    def act_on_tensors(self, data: Step) -> Step:
+        """Return what the policies write."""
+        parts = {key: value.chunk(len(self.policies)) for key, value in data.items()}
+        written = []
+        for number, policy in enumerate(self.policies):
+            torch.set_rng_state(self.states[number])
+            own = {key: value[number] for key, value in parts.items()}
+            written.append(acted(policy, own, data["observation"].device))
+            self.states[number] = torch.get_rng_state()
+        return {key: torch.cat([each[key] for each in written]) for key in written[0]}
 
 
 def _join_policies(agent: Agent, policies: Sequence[Policy]) -> Policy:

@@ -7,7 +7,7 @@ exchange messages are a `Lockstep` each, coupled by `ctgraph_rl.learn.collective
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from functools import partial
@@ -20,7 +20,7 @@ from torchrl.envs import EnvBase
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues
 from ctgraph_rl.learn.collect import Policy, make_env, without_ends
-from ctgraph_rl.learn.evaluate import Evaluator
+from ctgraph_rl.learn.evaluate import Evaluator, evaluate_together
 from ctgraph_rl.learn.refusals import (
     check_adaptation,
     check_env,
@@ -115,6 +115,11 @@ class Group(Protocol):
         """Writes the actions of all rows, [agents * num_envs]; those of an agent are adjacent."""
         ...
 
+    @property
+    def greedy_policy(self) -> Policy | None:
+        """Writes the most likely actions of as many adjacent rows of each agent; None: agents are evaluated in turn."""
+        ...
+
     def start_task(self, task: int | None = None) -> None:
         """Begin a task."""
         ...
@@ -134,7 +139,7 @@ class Group(Protocol):
 class Alone:
     """A group of one learner."""
 
-    generators = device_generators = None
+    generators = device_generators = greedy_policy = None
 
     def __init__(self, agent: Agent) -> None:
         self.agents = [agent]
@@ -207,6 +212,7 @@ class Lockstep:
                 self.meters.append(UnitMeter(curriculum, agent, log, log_units))
         self.env = self._make_env(device)
         self.can_resume = True
+        self.events = getattr(group.agents[0], "events", ())
         self.evaluators = []
         for agent, seed, log in zip(group.agents, seeds, logs, strict=True):
             untrained = deepcopy(agent.policy) if isinstance(curriculum, Stream) else None
@@ -323,11 +329,11 @@ class Lockstep:
         self._evaluate(self.frames)
 
     def _evaluate(self, frames: int) -> None:
-        for number, (evaluator, agent) in enumerate(zip(self.evaluators, self.group.agents, strict=True)):
-            if number not in self.failed:
-                evaluator.evaluate_if_due(agent, frames)
+        moment = self.curriculum.moment(frames)
         is_end = self.curriculum.is_end(frames)
-        if frames and (is_end or self.curriculum.moment(frames)):
+        if moment is not None:
+            evaluate_members(self.evaluators, self.group, frames, moment, self.failed)
+        if frames and (is_end or moment):
             self._measure_units(self.curriculum.block_at(frames), "end" if is_end else "during", frames)
 
     def _measure_units(self, block: int, moment: str, frames: int | None = None) -> None:
@@ -339,12 +345,11 @@ class Lockstep:
         start = self.frames
         self.frames += batch.numel() // len(self.logs)
         self.batch = without_ends(batch)
-        self.returns = []
         share = guided(start - segment.start, self.curriculum)
-        parts = [batch] if len(self.logs) == 1 else batch.chunk(len(self.logs))
         before = [weights_of(meter.agent) for meter in self.meters]
         is_frozen = self.frames > self.last_learned
         learnt: Sequence[Learnt] = [{} for _ in self.logs] if is_frozen else self.group.learn(self.batch)
+        logged: list[NamedValues | None] = [None] * len(self.logs)
         for number, measured in enumerate(learnt):
             if number in self.failed:
                 continue
@@ -357,10 +362,8 @@ class Lockstep:
                 continue
             if self.meters:
                 measurements |= norms(self.group.agents[number], before[number], measurements)
-            events = getattr(self.group.agents[number], "events", ())
-            log = self.logs[number]
-            part = parts[number]
-            self.returns.append(log_training(log, self.curriculum, part, start, measurements, events=events))
+            logged[number] = measurements
+        self.returns = log_training(self.logs, self.curriculum, batch, start, logged, events=self.events)
         if self.meters and self.meters[0].each_batch:
             self._measure_units(self.block, "batch")
 
@@ -419,6 +422,23 @@ class Lockstep:
         torch.set_rng_state(state["random"])
         if state["random_cuda"] is not None:
             torch.cuda.set_rng_state(state["random_cuda"], self.env.device)
+
+
+def evaluate_members(
+    evaluators: Sequence[Evaluator], group: Group, frames: int, moment: str, failed: Collection[int]
+) -> None:
+    """Evaluate all members that have not failed, in one environment where they can share one."""
+    how = evaluators[0].curriculum.evaluation
+    left = [number for number in range(len(evaluators)) if number not in failed]
+    agents = group.agents
+    draws_on_device = group.device_generators is not None and not how.greedy
+    if group.generators is None or how.exact or draws_on_device:
+        for number in left:
+            evaluators[number].evaluate_if_due(agents[number], frames)
+    elif how.greedy and group.greedy_policy is not None:
+        evaluate_together(evaluators, agents, frames, moment, group.greedy_policy, left)
+    else:
+        evaluate_together([evaluators[number] for number in left], [agents[number] for number in left], frames, moment)
 
 
 def run_loop(

@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase
 
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.learn.collect import ENDS, Policy, batches
-from ctgraph_rl.learn.evaluate import EPISODE_KEYS, episode_means
+from ctgraph_rl.learn.evaluate import EPISODE_KEYS, means_by_part
 from ctgraph_rl.learn.guide import Guide, guided_share
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -119,39 +119,50 @@ def guided(frames: int, curriculum: Curriculum) -> dict[str, float]:
 
 
 def log_training(
-    log: RunLog,
+    logs: Sequence[RunLog],
     curriculum: Curriculum,
     batch: TensorDictBase,
     start: int,
-    measurements: Mapping[str, float],
+    measurements: Sequence[Mapping[str, float] | None],
     *,
     events: Collection[str] = (),
-) -> float:
-    """Append a line for each block that a batch has frames of; return the mean return of the last line.
+) -> list[float]:
+    """Append a line of each learner for each block that a batch has frames of; return the last lines' mean returns.
 
     Args:
-        log: where lines are appended.
-        batch: [rows, steps].
-        start: frames before it.
-        measurements: of the batch.
+        logs: of each learner.
+        batch: [learners * rows, steps].
+        start: frames of a learner before it.
+        measurements: of each learner on the batch; None for one that measures nothing any more.
         events: names of measurements of the batch's end, 0 in its other parts.
     """
     frames = start
-    end = start + batch.numel()
-    for part in _split_at_ends(batch, start, curriculum.ends):
-        frames += part.numel()
+    num_rows = len(batch) // len(logs)
+    end = start + num_rows * batch.shape[1]
+    returns: list[float] = []
+    for part in _split_at_ends(batch, num_rows, start, curriculum.ends):
+        frames += num_rows * part.shape[1]
+        block = curriculum.block_at(frames)
         after = part["next"].get(ENDS, part["next"])
-        episodes = episode_means(after.select(*EPISODE_KEYS, strict=False)[after["done"].squeeze(-1)])
-        measured = episodes | dict(measurements)
-        if frames != end:
-            measured |= dict.fromkeys(measurements.keys() & set(events), 0)
-        log.append("training", block=curriculum.block_at(frames), frames=frames, **measured)
-    return episodes["return_mean"]
+        is_end = after["done"].squeeze(-1)
+        counts = is_end.unflatten(0, (len(logs), num_rows)).sum(dim=(1, 2)).tolist()
+        means = means_by_part(after.select(*EPISODE_KEYS, strict=False)[is_end], counts)
+        returns = []
+        for log, episodes, own in zip(logs, means, measurements, strict=True):
+            if own is None:
+                continue
+            measured = episodes | dict(own)
+            if frames != end:
+                measured |= dict.fromkeys(own.keys() & set(events), 0)
+            log.append("training", block=block, frames=frames, **measured)
+            returns.append(episodes["return_mean"])
+    return returns
 
 
-def _split_at_ends(batch: TensorDictBase, start: int, ends: Sequence[int]) -> Iterator[TensorDictBase]:
-    rows, steps = batch.shape
+def _split_at_ends(batch: TensorDictBase, rows: int, start: int, ends: Sequence[int]) -> Iterator[TensorDictBase]:
+    """Yield the parts of a batch within one block, where a learner has so many rows."""
+    steps = batch.shape[1]
     first = bisect_right(ends, start)
-    last = bisect_left(ends, start + batch.numel())
+    last = bisect_left(ends, start + rows * steps)
     cuts = [0, *((end - start) // rows for end in ends[first:last]), steps]
     return (batch[:, begin:end] for begin, end in pairwise(cuts))

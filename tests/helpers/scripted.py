@@ -107,7 +107,7 @@ class ScriptedGroup:
     def __init__(self, count: int, policy) -> None:
         self.agents = [Told(policy, num_envs=8, num_steps=4) for _ in range(count)]
         self.generators = []
-        self.device_generators = None
+        self.device_generators = self.greedy_policy = None
         self.policy = policy
 
     def start_task(self, task=None) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +17,11 @@ from helpers.sweeping import sweep
 
 from baselines.update.captured import CapturedGroup, Draws
 from baselines.update.update import losses_of, total_loss
-from ctgraph_rl import Block, RunLog
+from ctgraph_rl import Block, Evaluation, RunLog
 from ctgraph_rl.core import philox
 from ctgraph_rl.learn import collect
+from ctgraph_rl.learn.evaluate import Evaluator
+from ctgraph_rl.learn.loop import evaluate_members
 from ctgraph_rl.learn.stacked import learn_together
 from ctgraph_rl.runs import checkpoints, job
 from ctgraph_rl.runs import session as runs_session
@@ -110,6 +114,27 @@ def test_draws_go_on_from_a_saved_state(make):
 
     assert torch.equal(group.draws.words(8), expected)
     assert group.draws.seed.flatten().tolist() == [*THREE_SEEDS]
+
+
+@pytest.mark.parametrize(("name", "num_lengths"), [("ppo", 2), ("lstm_ppo", 1)])
+def test_seeds_are_evaluated_at_once_as_each_alone_and_without_one_that_failed(make, name, num_lengths):
+    group = make(name)
+    learn(group)
+    with torch.no_grad():
+        for parameter in chain(*(agent.parameters() for agent in group.agents)):
+            parameter.mul_(9)  # so that seeds act in different ways
+    group.stack.read()
+    frames = CURRICULUM.num_frames
+    curriculum = replace(CURRICULUM, evaluation=Evaluation(6, greedy=True))
+    at_once, alone = ([Evaluator(curriculum, seed, RunLog()) for seed in THREE_SEEDS] for _ in range(2))
+
+    evaluate_members(at_once, group, frames, "after", failed={1})
+    for evaluator, agent in zip(alone, group.agents, strict=True):
+        evaluator.evaluate_if_due(agent, frames)
+
+    found, expected = ([lines(each.log) for each in some] for some in (at_once, alone))
+    assert found == [expected[0], [], expected[2]]
+    assert len({line["length_mean"] for line in expected[0] + expected[2]}) >= num_lengths
 
 
 def test_what_changes_an_agent_at_the_start_of_a_task_changes_what_acts(make):
