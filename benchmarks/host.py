@@ -11,6 +11,7 @@ import argparse
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
+from copy import deepcopy
 from functools import wraps
 from io import StringIO
 from pathlib import Path
@@ -18,7 +19,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 from unittest.mock import patch
 
-import hydra
 import torch
 from tensordict import TensorDictBase
 
@@ -28,7 +28,6 @@ from baselines.update.stack import Stack
 from ctgraph_rl.checks import at_least_one, require
 from ctgraph_rl.learn import loop
 from ctgraph_rl.log.escape import markdown_table
-from ctgraph_rl.packages import conf_dir
 from ctgraph_rl.runs import config, job, session
 
 SMALL = ("agent.num_envs=32", "curriculum.num_frames=1024", "together=true", "checkpoint_seconds=1e9")
@@ -104,13 +103,15 @@ def measured_parts() -> Iterator[Timer]:
 
 def run(num_seeds: int) -> Timer:
     """Run a group of seeds in a temporary folder."""
-    with TemporaryDirectory() as folder, hydra.initialize_config_dir(conf_dir(), version_base="1.3"):
+    first = config.composed(["agent=lstm_ppo", *SMALL])
+    with TemporaryDirectory() as folder:
         cells = []
         for seed in range(num_seeds):
-            cfg = hydra.compose("config", overrides=["agent=lstm_ppo", *SMALL, f"seed={seed}"])
             run_dir = Path(folder, str(seed))
             run_dir.mkdir()
-            cells.append((cfg, run_dir))
+            own = deepcopy(first)
+            own.seed = seed
+            cells.append((own, run_dir))
         with measured_parts() as timer, redirect_stdout(StringIO()), redirect_stderr(StringIO()):
             job.run_as_one(cells)
     return timer
