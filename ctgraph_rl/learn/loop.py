@@ -436,7 +436,7 @@ def evaluate_members(
         for number in left:
             evaluators[number].evaluate_if_due(agents[number], frames)
     elif how.greedy and group.greedy_policy is not None:
-        evaluate_together(evaluators, agents, frames, moment, group.greedy_policy, left)
+        evaluate_together(evaluators, agents, frames, moment, policy=group.greedy_policy, logged=left)
     else:
         evaluate_together([evaluators[number] for number in left], [agents[number] for number in left], frames, moment)
 
