@@ -64,7 +64,7 @@ class Costless(CapturedGroup):
 
 
 class Timer:
-    """CPU seconds of functions by part; what one part calls of another counts as its own."""
+    """CPU seconds of functions by part; what one part calls of another counts to the first."""
 
     def __init__(self) -> None:
         self.seconds = dict.fromkeys(PARTS, 0.0)

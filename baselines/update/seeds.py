@@ -91,7 +91,7 @@ class SeedGroup:
 
     @property
     def agents(self) -> Sequence[Agent]:
-        """The agents as they are after the last batch."""
+        """The agents after the last batch."""
         return self._agents
 
     def _task_has_changed(self) -> None:

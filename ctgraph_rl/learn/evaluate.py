@@ -347,7 +347,7 @@ def evaluate_together(
     policy: Policy | None = None,
     logged: Collection[int] | None = None,
 ) -> None:
-    """Evaluate members of one curriculum of CT-graphs as each does alone, in one environment.
+    """Evaluate members of one curriculum of CT-graphs in one environment, with the bits of one at a time.
 
     Args:
         agents: of each member.
@@ -387,7 +387,7 @@ def evaluate_together(
 
 
 class InTurn:
-    """A policy of equal slices of rows, which draw from generators of their own.
+    """A policy of equal slices of rows, each with a separate generator.
 
     Args:
         policies: of each slice.
