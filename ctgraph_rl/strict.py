@@ -19,7 +19,7 @@ from typing import Any
 
 import yaml
 
-from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_shallow, repeated, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, as_path, is_shallow, repeated, require
 from ctgraph_rl.disk import in_words, read_regular
 
 MAX_NESTING = 32
@@ -96,8 +96,9 @@ def json_object(
     is_path = isinstance(path_or_dict, (str, os.PathLike))
     require((is_path, f"from_json needs the path of a JSON file or a dict, got {path_or_dict!r}"))
     try:
+        path = as_path("path", path_or_dict)
         with within(path_or_dict):
-            data = read_regular(path_or_dict, most)
+            data = read_regular(path, most)
     except OSError as error:
         raise ValueError(in_words(error)) from error
     try:

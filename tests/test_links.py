@@ -43,7 +43,7 @@ ALLOWED = {
     ("ctgraph_rl.log.export", "arguments.out.mkdir"): "named by the user",
     ("ctgraph_rl.log.export", "where.mkdir"): "in a folder that was empty",
     ("ctgraph_rl.log.files", "file.truncate"): "a file that open_own opened",
-    ("ctgraph_rl.log.refuse", "os.open"): "the null device, in place of a broken pipe",
+    ("ctgraph_rl.cli", "os.open"): "the null device, in place of a broken pipe",
     ("ctgraph_rl.log.run_log", "file.truncate"): "as above",
     ("ctgraph_rl.report.page", "folder.mkdir"): "named by the user",
     ("ctgraph_rl.runs.checkpoints", "each.save"): "a method of Checkpoints, which writes through ctgraph_rl.disk",

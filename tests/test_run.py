@@ -79,6 +79,9 @@ def test_the_first_line_of_the_log_holds_all_that_the_numbers_depend_on(finished
         "protocol",
         "experts",
         "save_optimiser",
+        "objective_until",
+        "freeze_after",
+        "log_units",
     }
     assert first["config"]["curriculum"]["num_frames"] == 1024
     assert set(first["versions"]) == {"ctgraph_rl", "torch", "torchrl", "tensordict", "python"}

@@ -79,7 +79,7 @@ REFUSED = [
     (["objective_until=0.5"], ["error: objective_until=0.5 needs a metric, such as objective=online_return\n"]),
     (
         ["objective=forgetting", "objective_until=0.5"],
-        ["objective=forgetting must be a metric of training with objective_until=0.5: ", "online_return\n"],
+        ["objective=forgetting must be a metric of training with objective_until=0.5: ", "online_return"],
     ),
     (
         ["objective=online_return", "objective_until=0.5", "experts=true"],

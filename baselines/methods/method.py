@@ -17,11 +17,13 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from baselines.methods.parts.weights import Weights
-from baselines.parts.hooks import Hooks
+from baselines.parts.hooks import Hooks, PlasticityHooks
 from baselines.parts.learner import Learner
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import NamedValues, TakesNumbers, require, require_memory
 from ctgraph_rl.tasks.curriculum import Curriculum
+
+NO_PLASTICITY = PlasticityHooks()
 
 MOST_COPIES = 128
 """Policies with other weights that are kept; a task beyond gets a new copy each time."""
@@ -267,6 +269,11 @@ class AgentWithMethod(nn.Module):
         return cast(Method, self.agent.method)
 
     @property
+    def plasticity(self) -> PlasticityHooks:
+        """The agent's plasticity; one that does nothing where it has none."""
+        return getattr(self.agent, "plasticity", NO_PLASTICITY)
+
+    @property
     def unwrapped(self) -> Learner:
         """The agent without its method."""
         return self.agent
@@ -292,7 +299,7 @@ class AgentWithMethod(nn.Module):
 
     def start_task(self, task: int | None = None) -> None:
         """Start a task, for the plasticity, then the method, then the agent."""
-        self.agent.plasticity.start_task()
+        self.plasticity.start_task()
         self.method.start_task(task)
         self.agent.start_task(task)
 
@@ -303,7 +310,7 @@ class AgentWithMethod(nn.Module):
 
     def loss(self, batch: Mapping[Any, Tensor] | TensorDictBase) -> Mapping[str, Tensor]:
         """Return the agent's losses, and the penalties of plasticity and method."""
-        kept = self.agent.plasticity.penalties(batch, self.agent.weights)
+        kept = self.plasticity.penalties(batch, self.agent.weights)
         return {**self.agent.loss(batch), **kept, **self.method.penalties(batch, self.agent.weights)}
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
