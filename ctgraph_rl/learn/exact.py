@@ -3,6 +3,7 @@
 Without noise on reading, an agent can have seen finitely many things. A policy without memory is a table by image,
 valued by backward induction (`ctgraph_rl.tasks.values`). With memory, all histories are played at once with their
 probabilities. They branch at decisions, at waits and where images are drawn, as an action that fails ends an episode.
+The graph gives this tree. `ctgraph_rl.learn.histories` finds that of a batch by comparing frames, which are not here.
 
 Where waits are drawn (p > 0), stays of a probability below `LEAST_STAY` are left out, which changes a success rate by
 less than (d + 1) times that.

@@ -134,8 +134,10 @@ def _words(values: Sequence[Tensor]) -> Tensor:
         flat = value.flatten(1) if value.ndim > 1 else value.unsqueeze(1)
         octets = flat.contiguous().view(torch.uint8)
         missing = -octets.shape[1] % 8
-        if missing or octets.storage_offset() % 8:
+        if missing:
             octets = torch.nn.functional.pad(octets, (0, missing))
+        elif octets.storage_offset() % 8 or octets.stride(0) % 8:
+            octets = octets.clone(memory_format=torch.contiguous_format)
         parts.append(octets.view(torch.int64))
     return torch.cat(parts, dim=1)
 

@@ -7,13 +7,15 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers.small_agents import agent_of, learnt_from, others_slow
+from helpers.small_agents import SETTINGS, agent_of, batches, learnt_from, others_slow, stay, with_method
+from helpers.small_agents import made as builder_of
 from torch import Tensor
 
 from baselines.parts import merge as merging
 from baselines.parts.merge import KIND, merge
 from baselines.parts.networks import HISTORY, INPUT
 from baselines.parts.policy_gradient import critic_loss
+from baselines.update.update import losses_of, total_loss, transform_gradients, update_state
 from ctgraph_rl import CTGraphEnv
 from ctgraph_rl.learn.collect import collect
 from ctgraph_rl.packages import conf_dir
@@ -109,6 +111,43 @@ def test_losses_and_gradients_of_histories_are_those_of_all_frames(compose, name
         "a short batch",
     )
     torch.testing.assert_close(found, expected, atol=1e-10, rtol=1e-10)
+
+
+def with_method_computed(attached, minibatch: dict, once: bool) -> tuple[dict[str, Tensor], list[Tensor]]:
+    """Losses and penalties in float64, and the gradients of what is trained."""
+    learner = deepcopy(attached).double().unwrapped
+    given = {key: value for key, value in of_dtype(minibatch, torch.float64).items() if once or key not in NUMBERS}
+    state = update_state(learner)
+    losses = losses_of(learner, state, given)
+    gradients = torch.autograd.grad(total_loss(losses), state.weights, materialize_grads=True)
+    return losses, list(transform_gradients(learner, learner.weights, state, gradients))
+
+
+METHODS = ("ewc", "si", "mas", "mask_ri", "mask_lc", "clear", "packnet")
+WITH_METHODS = [(name, method) for name in ("ppo", "lstm_ppo") for method in METHODS]
+
+
+@pytest.mark.parametrize(("name", "method"), others_slow(WITH_METHODS, ("ppo", "ewc"), ("lstm_ppo", "clear")))
+def test_with_a_method_where_a_task_returns_histories_give_what_all_frames_do(compose, name, method):
+    tasks = (ONE, TWO)
+    make_method = builder_of(compose, "method", method, *SETTINGS.get(method, []))
+    attached = with_method(compose, name, make_method(), tasks, "agent.num_minibatches=1")
+    stay(attached, 0, tasks)
+    stay(attached, 1, tasks)
+    attached.start_task(0)
+
+    for steps in (attached.unwrapped.num_steps, 5):  # a whole batch, and a shortened last one
+        batch = batches(attached, ONE, 1)[0][:, :steps]
+        minibatch = learnt_from(attached.unwrapped, batch)[0]
+        (found, gradients), (expected, of_expected) = (
+            with_method_computed(attached, minibatch, once) for once in (True, False)
+        )
+
+        assert len(merge(minibatch)[0]) < minibatch["action"].numel()
+        own = {"loss_objective", "loss_critic", "loss_entropy", "entropy"}
+        assert (found.keys() > own) == (method in ("ewc", "si", "mas", "clear"))
+        torch.testing.assert_close(found, expected, atol=1e-10, rtol=1e-10)
+        torch.testing.assert_close(gradients, of_expected, atol=1e-10, rtol=1e-10)
 
 
 ROUNDED = [

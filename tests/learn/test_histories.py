@@ -89,6 +89,13 @@ def test_rows_that_differ_by_one_bit_are_of_different_groups(place):
     assert torch.equal(values[examples][groups][:, 1:], values[:, 1:])
 
 
+def test_a_single_row_of_odd_length_in_a_wider_tensor_is_a_group():
+    values = torch.arange(3 * 19, dtype=torch.uint8).view(3, 19)
+
+    for width in (8, 11, 16):
+        assert [part.tolist() for part in distinct([values[:1, :width]])] == [[0], [0]]
+
+
 def test_rows_that_differ_by_less_than_rounding_are_of_different_groups():
     values = torch.tensor([[1e30, 0.0], [1e30, 1.0], [1e30, 0.0]])
 
