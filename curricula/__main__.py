@@ -44,7 +44,7 @@ def _show_list(rows: tuple[tuple[str, ...], ...], form: str) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    form = argparse.ArgumentParser(add_help=False, argument_default=argparse.SUPPRESS)
+    form = OneLineParser(add_help=False, argument_default=argparse.SUPPRESS)
     form.add_argument("--format", choices=("text", *FORMATS), help="default: text")
     form.add_argument("--config-dir", type=Path, metavar="DIR", help="also knows the curricula of this directory")
     about = "List all curricula, or describe one."

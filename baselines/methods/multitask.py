@@ -38,7 +38,7 @@ class Multitask(Method):
                 "Multitask has no boundaries to give task ids at: set protocol.task_id=one_hot or hidden",
             ),
         )
-        at_once = Block(tasks, curriculum.num_frames, ByEpisode())
+        at_once = Block(tuple(tasks), curriculum.num_frames, ByEpisode())
         return replace(curriculum, blocks=(at_once,))
 
     @override

@@ -207,7 +207,7 @@ def _acts_on_tensors(policy: Policy) -> bool:
         return False
     if not isinstance(policy, nn.Module):
         return True
-    return not (policy._forward_hooks or policy._forward_pre_hooks or policy._compiled_call_impl)  # type: ignore[attr-defined]
+    return not (policy._forward_hooks or policy._forward_pre_hooks or policy._compiled_call_impl)
 
 
 def _is_captured(env: EnvBase, policy: Policy) -> bool:

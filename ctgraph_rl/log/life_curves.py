@@ -79,7 +79,7 @@ def life_of_blocks(log: RunLog, stream: Stream, count: int) -> NamedValues:
         zero=zero,
         reward=paid,
         gain=by_block(lambda task: optimal_gain(task, pause=int(hides))),
-        alike=all(replace(task, goal=first.goal) == first for task in others),  # type: ignore[call-overload]
+        alike=all(replace(task, goal=first.goal) == first for task in others),
     )
     noisy = not stream.evaluation.exact and any(task.reward_std for task in stream.examples)
     return {

@@ -90,7 +90,8 @@ def _select_of_curriculum(curriculum: Curriculum, number: int) -> Selection:
     labels = curriculum.labels
     rule = f"--task must be in 1..{len(tasks)}, the tasks of {curriculum.name}, got {number}"
     require((is_int(number, 1, len(tasks)), rule))
-    return Selection(tasks[number - 1], f"{curriculum.name}, task {number}: {labels[number - 1]}")
+    (task,) = ct_graphs([tasks[number - 1]], "a drawing or a game")
+    return Selection(task, f"{curriculum.name}, task {number}: {labels[number - 1]}")
 
 
 def _select_of_run(run: Path, number: int) -> Selection:

@@ -66,7 +66,7 @@ class AgentContract:
         """Of the specs' type and range."""
         curriculum = self.curriculum()
         agent = self.build(curriculum)
-        env = make_env(curriculum, curriculum.tasks[:1] * 3, 0)
+        env = make_env(curriculum, [curriculum.tasks[0]] * 3, 0)
         data = env.reset().update(agent.initial_state(3))
 
         with torch.no_grad():
