@@ -159,13 +159,13 @@ class Run:
         return [task for task in self.returns if task in evaluated]
 
     def _at_end(self, metric: str) -> dict[str, float | None]:
-        if not self.metrics:
+        if not self.metrics or "life" in self.about:  # whose tasks are windows
             return {}
         last_block = len(self.about.get("trained") or ()) or max(each.block or 0 for each in self.values)
         found: dict[str, float | None] = {}
         for each in self.values:
             if each.metric == metric and each.task is not None:
-                is_last = each.moment != "during" and (each.block == last_block or "life" in self.about)
+                is_last = each.moment != "during" and each.block == last_block
                 found[each.task] = each.value if is_last else found.get(each.task)
         return found
 

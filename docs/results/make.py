@@ -22,6 +22,7 @@ PAGES = {
     "memory": "studies.memory.page",
     "no_labels": "studies.no_labels.page",
     "profile": "studies.profile",
+    "streams": "studies.streams",
 }
 """Pages, and the modules that make them."""
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
+from statistics import fmean
 from unittest.mock import patch
 
 import pytest
@@ -18,7 +20,8 @@ from ctgraph_rl import RunLog, learn_curriculum
 from ctgraph_rl.learn.refusals import notes
 from ctgraph_rl.learn.stacked import why_not_together
 from ctgraph_rl.log.scores import scores
-from ctgraph_rl.runs.train import new_agent
+from ctgraph_rl.runs.read import read_run
+from ctgraph_rl.runs.train import new_agent, train
 from ctgraph_rl.tasks.gain import optimal_gain
 
 SAMPLED = {"exact": False, "num_episodes": 4}
@@ -183,3 +186,22 @@ def test_an_agent_keeps_copies_of_its_policy_for_few_tasks():
 
     assert len({id(policy) for policy in policies}) == 199
     assert len(agent._copies) == MOST_COPIES
+
+
+def test_tables_of_a_life_have_windows_in_place_of_tasks(tmp_path):
+    life = stream({"every": 0}, num_tasks=25)
+    agent = learner(life)
+    train(life, agent, tmp_path, 0, config={"agent": {"_target_": "baselines.a2c.A2C"}, "seed": 0})
+
+    run = read_run(tmp_path)
+
+    log = RunLog.read(tmp_path / "run.jsonl")
+    at_end = {}
+    for m in log.of_kind("evaluation"):
+        if m["moment"] == "after":
+            at_end.setdefault(m["block"], m["return_mean"])
+    assert run.history.labels[:6] == (*(f"tasks {n}-{n + 2}" for n in (1, 4, 7, 10, 13)), "tasks 16-17")
+    assert run.history.evaluations["tasks 4-6"] == [(6 * 64, pytest.approx(fmean(at_end[n] for n in (4, 5, 6))))]
+    assert run.windows("window_return")[1] == pytest.approx(fmean(at_end[n] for n in (4, 5, 6)))
+    assert all(math.isnan(value) for value in run.windows("retention_100"))
+    assert [curve[-1][0] for curve in run.history.training.values()][:3] == [3 * 64, 6 * 64, 9 * 64]

@@ -115,6 +115,9 @@ def test_the_present_task_is_evaluated_and_at_a_blocks_end_the_next_and_earlier_
     assert numbers(64) == [1, 2]
     assert numbers(64 * 12) == [12, 13, 11, 2]
     assert numbers(64 * 20) == [20, 1, 19, 10]
+    dissimilar = stream(num_tasks=200)
+    assert [number for number, _ in dissimilar.evaluated(64 * 150).values()] == [150, 151, 149, 140, 50]
+    assert len(dissimilar.evaluated(64 * 200)) == 4  # no task is next
 
 
 @pytest.mark.parametrize(

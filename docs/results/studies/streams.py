@@ -1,0 +1,128 @@
+"""A life of a hundred tasks: streams.md."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from statistics import fmean
+from string import Template
+
+from studies.raw import HERE, TEMPLATES, Raw, groups, machines, mean_of, read, table
+from studies.verdicts import Effect
+
+NAME = "streams"
+PAGE = HERE / "streams.md"
+PICTURE = HERE / "streams.png"
+
+AGENTS = {"ppo": "PPO", "lstm_ppo": "LSTM-PPO", "dqn": "DQN"}
+METHODS = {"finetune": "fine-tuned", "ewc": "EWC", "mask_ri": "Mask RI", "scratch": "new weights for each task"}
+NUM_WINDOWS = 10
+SHARES = (0.0, 1.0)
+
+LESS = 0.1
+"""Of a share of tasks, the smallest difference that counts."""
+
+
+def runs() -> dict[tuple[str, ...], Raw]:
+    """Return the lines of all seeds by agent and method."""
+    return groups(read(NAME), "agent", "method")
+
+
+def solved(line: dict[str, str]) -> list[float]:
+    """Return the share of tasks solved at the end of their blocks in each window."""
+    return [float(line[f"solved_{window}"]) for window in range(1, NUM_WINDOWS + 1)]
+
+
+def numbers(lines: Raw, column: str) -> list[float | None]:
+    """Return a metric of each seed, None where it is undefined."""
+    return [float(line[column]) if line[column] else None for line in lines]
+
+
+def table_of_runs() -> str:
+    """Return a row for each agent and method: means over seeds with their intervals."""
+    rows = []
+    for (agent, method), lines in runs().items():
+        per_frame = [float(line["frame_regret"]) / frames(line) for line in lines]
+        seconds = [float(line["cpu_seconds"]) / int(line["num_tasks"]) for line in lines]
+        rows.append(
+            [
+                f"{AGENTS[agent]}, {METHODS[method]}",
+                str(len(lines)),
+                mean_of([fmean(solved(line)) for line in lines], SHARES),
+                mean_of([solved(line)[0] for line in lines], SHARES),
+                mean_of([solved(line)[-1] for line in lines], SHARES),
+                mean_of(numbers(lines, "retention_1"), (0.0, float("inf"))),
+                mean_of(numbers(lines, "retention_10"), (0.0, float("inf"))),
+                f"{fmean(per_frame):.3f}",
+                f"{fmean(seconds):.1f}",
+            ]
+        )
+    head = ["learner", "seeds", "solved", "first window", "last window", "kept after 1", "after 10", "regret per frame"]
+    return table([*head, "CPU seconds a task"], rows)
+
+
+def frames(line: dict[str, str]) -> int:
+    """Return the frames of a life."""
+    return int(line["num_tasks"]) * int(line["num_frames"])
+
+
+def claims() -> str:
+    """Return a row for each sentence with its verdict."""
+    found = runs()
+    rows = []
+    for agent, name in AGENTS.items():
+        losses = [solved(line)[0] - solved(line)[-1] for line in found[agent, "finetune"]]
+        rows.append(_claim(f"{name}, fine-tuned, solves fewer tasks in the last window than in the first", losses))
+        for method in ("ewc", "mask_ri", "scratch"):
+            gains = []
+            for line in found[agent, method]:
+                same = [each for each in found[agent, "finetune"] if each["seed"] == line["seed"]]
+                if same:
+                    gains.append(fmean(solved(line)) - fmean(solved(same[0])))
+            rows.append(_claim(f"{name} solves more tasks with {METHODS[method]} than fine-tuned", gains))
+    return table(["sentence", "difference", "seeds", "verdict"], rows)
+
+
+def _claim(sentence: str, values: list[float]) -> list[str]:
+    effect = Effect(values, LESS, room=1.0)
+    return [sentence, mean_of(values, effect.bounds), str(len(values)), effect.verdict]
+
+
+def draw(path: Path) -> None:
+    """Draw the share of tasks solved by window, a panel for each agent, means over seeds."""
+    from ctgraph_rl.draw.style import new_figure, save_figure
+
+    found = runs()
+    figure = new_figure(7.2, 2.6)
+    panels = figure.subplots(1, len(AGENTS), sharey=True)
+    for axes, (agent, name) in zip(panels, AGENTS.items(), strict=True):
+        for position, (method, words) in enumerate(METHODS.items()):
+            lines = [solved(line) for line in found.get((agent, method), [])]
+            if lines:
+                means = [fmean(values) for values in zip(*lines, strict=True)]
+                axes.plot(range(1, NUM_WINDOWS + 1), means, color=f"C{position}", linewidth=1, label=words)
+        axes.set_title(name, fontsize=9)
+        axes.set(xlabel="window of 10 tasks", ylim=(-0.05, 1.05))
+    panels[0].set_ylabel("share of tasks solved")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper left", ncols=4, fontsize=7)
+    save_figure(figure, path, 220)
+
+
+def page() -> str:
+    """Return the page: its template with its tables and numbers."""
+    lines = read(NAME)
+    rates = {AGENTS[line["agent"]]: line["learning_rate"] for line in lines}
+    text = (TEMPLATES / "streams.md").read_text(encoding="utf-8")
+    return Template(text).substitute(
+        table=table_of_runs(),
+        claims=claims(),
+        rates=", ".join(f"{name} {rate}" for name, rate in rates.items()),
+        frames=f"{int(lines[0]['num_frames']):,}",
+        machines=machines(NAME),
+    )
+
+
+def make() -> None:
+    """Write the page and its figure."""
+    draw(PICTURE)
+    PAGE.write_text(page(), encoding="utf-8")
