@@ -35,6 +35,8 @@ WRITING = {
 """Functions and methods that write files or make folders, unless what they write into is in memory."""
 
 ALLOWED = {
+    ("benchmarks.host", "TemporaryDirectory"): "a folder of this process",
+    ("benchmarks.host", "run_dir.mkdir"): "in it",
     ("ctgraph_rl.board.isolate", "group.mkdir"): "a cgroup",
     ("ctgraph_rl.board.isolate", "path.open"): "a file of a cgroup",
     ("ctgraph_rl.board.relearn", "run_dir.mkdir"): "in the folder of a process",
