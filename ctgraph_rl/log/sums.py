@@ -27,7 +27,7 @@ RESULTS = (LOG, CURRICULUM, AGENT, METRICS)
 def write_metrics(
     path: Path | str, metrics: ReadOnlyValues, sums: ReadOnlyValues | None = None, of_windows: Collection[str] = ()
 ) -> None:
-    """Write metrics as JSON: by name the value, definition, formula and source, or why it is undefined.
+    """Write metrics as JSON, one a line: by name the value, definition, formula and source, or why it is undefined.
 
     Terms are left out, as pairs of tasks grow with the square of tasks; `ctgraph_rl.log.scores.scores` has them.
 
@@ -37,9 +37,10 @@ def write_metrics(
     """
     content = {name: _values(name, metric, of_windows) for name, metric in metrics.items()}
     if sums is not None:
-        files = {**sums, METRICS: sum_of(_text(content))}
+        files = {**sums, METRICS: _sum_of_metrics(content)}
         content = {FILES: {"run": uuid4().hex, **files}, **content}
-    write_whole(path, _text(content))
+    lines = [f"{json.dumps(name)}: {json.dumps(value)}" for name, value in content.items()]
+    write_whole(path, "{\n" + ",\n".join(lines) + "\n}\n")
 
 
 def _values(name: str, metric: Any, of_windows: Collection[str]) -> NamedValues:
@@ -50,8 +51,8 @@ def _values(name: str, metric: Any, of_windows: Collection[str]) -> NamedValues:
     return values
 
 
-def _text(content: ReadOnlyValues) -> bytes:
-    return (json.dumps(content, indent=2) + "\n").encode()
+def _sum_of_metrics(content: ReadOnlyValues) -> NamedValues:
+    return sum_of(json.dumps(content).encode())
 
 
 def sums_of(run_dir: Path) -> NamedValues:
@@ -96,7 +97,7 @@ def stored_sums(run_dir: Path) -> Mapping[str, Mapping[str, Any]] | None:
         are_sums = all(name in RESULTS and {"bytes", "sha256"} <= files[name].keys() for name in files)
     except (AttributeError, KeyError, TypeError):
         are_sums = False
-    require((are_sums and own == sum_of(_text(content)), "it is not what was written"))
+    require((are_sums and own == _sum_of_metrics(content), "it is not what was written"))
     return files
 
 

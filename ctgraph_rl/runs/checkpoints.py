@@ -85,8 +85,11 @@ class Checkpoints:
         """Return whether it is time to save."""
         return at_block_end or self._last is None or time.monotonic() - self._last >= self.seconds
 
-    def save(self, state: RunState) -> None:
+    def save(self, state: RunState, is_like_others: bool = False) -> None:
         """Write a checkpoint, then remove the oldest, and broken ones later than the run.
+
+        Args:
+            is_like_others: whether one of a group was read back before, which has the same parts.
 
         Raises:
             OSError: if it cannot be written; names the sizes and the checkpoint that is kept.
@@ -94,7 +97,7 @@ class Checkpoints:
         """
         path = self.path_of(state["frames"])
         content = encoded(state)
-        if self._last is None:
+        if self._last is None and not is_like_others:
             try:
                 read_plain(content.partition(b"\n")[2])
             except ValueError as error:  # it could be written and never read
@@ -165,8 +168,8 @@ def offer_all(checkpoints: Sequence[Checkpoints], states: Callable[[], Sequence[
     first = checkpoints[0]
     stop = first.interrupt.is_asked
     if stop or first.is_due(at_block_end):
-        for each, state in zip(checkpoints, states(), strict=True):
-            each.save(state)
+        for number, (each, state) in enumerate(zip(checkpoints, states(), strict=True)):
+            each.save(state, is_like_others=number > 0)
     if stop:
         first.interrupt.exit()
 

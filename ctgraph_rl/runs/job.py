@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from omegaconf import DictConfig
@@ -62,8 +62,15 @@ ConfigAndPath = tuple[Any, Path]
 """A composed configuration, and its run's existing directory."""
 
 
-def build(cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None = None) -> RunMember:
-    """Build the objects of a configuration, the agent last, which decides the state of torch's global generator.
+class Recipe(NamedTuple):
+    """What the seeds of a configuration share."""
+
+    curriculum: Curriculum
+    make_agent: MakeAgent
+
+
+def recipe_of(cfg: DictConfig) -> Recipe:
+    """Return a configuration's curriculum, and what builds its agents.
 
     Raises:
         ValueError: for values out of range, and parts that do not fit.
@@ -75,7 +82,21 @@ def build(cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None = None) ->
     curriculum = curriculum_of(cfg, make_method())
     for task in curriculum.tasks if cfg.experts else ():  # refuses first what an agent cannot learn
         new_agent(expert_curriculum(curriculum, task), make_alone, cfg.seed)
-    make_agent = with_method(make_alone, make_method, curriculum, plasticity_of(cfg))
+    return Recipe(curriculum, with_method(make_alone, make_method, curriculum, plasticity_of(cfg)))
+
+
+def build(
+    cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None = None, recipe: Recipe | None = None
+) -> RunMember:
+    """Build the objects of a configuration, the agent last, which decides the state of torch's global generator.
+
+    Args:
+        recipe: by `recipe_of` another seed, whose curriculum is shared; None: of this configuration.
+
+    Raises:
+        ValueError: for values out of range, and parts that do not fit.
+    """
+    curriculum, make_agent = recipe_of(cfg) if recipe is None else recipe
     member = make_member(cfg, run_dir, curriculum, make_agent, settings=config.plain(cfg), interrupt=interrupt)
     usual = bool(cfg.get("plasticity")) and all(holds for holds, _ in unit_rules(curriculum, member.agent))
     member.log_units = usual if cfg.log_units is None else cfg.log_units
@@ -343,11 +364,12 @@ def learn(
         The error of each seed that failed, or that has an expert that failed.
     """
     members: dict[int, RunMember] = {}
+    recipe = recipe_of(cells[0][0]) if together else None
     for cfg, run_dir in cells:
         if built is not None and built.seed == cfg.seed:
             members[cfg.seed] = built
         else:
-            members[cfg.seed] = build(cfg, run_dir, interrupt)
+            members[cfg.seed] = build(cfg, run_dir, interrupt, recipe)
     first = cells[0][0]
     curriculum = members[first.seed].curriculum
     if first.experts and not curriculum.evaluation.every:

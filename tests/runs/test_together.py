@@ -160,11 +160,11 @@ def test_a_group_that_is_stopped_in_its_first_checkpoints_begins_again_and_says_
     save = checkpoints.Checkpoints.save
     calls: list[int] = []
 
-    def stopped(saved, state):
+    def stopped(saved, state, **how):
         calls.append(1)
         if len(calls) == 2:
             raise OSError(errno.ENOSPC, "No space left on device") if is_full else KeyboardInterrupt
-        save(saved, state)
+        save(saved, state, **how)
 
     with monkeypatch.context() as patch:
         patch.setattr(checkpoints.Checkpoints, "save", stopped)
