@@ -23,7 +23,7 @@ METHODS = {"finetune": "fine-tuning", "mask_ri": "Mask RI", "ewc": "EWC", "multi
 WIDTHS = dict(zip(METHODS, (3.6, 2.6, 1.8, 1.0), strict=True))
 """Widths of their lines: those below show where lines coincide."""
 
-IDS = {"": "", "at_boundaries": ", with task ids", "hidden": ", without task ids"}
+IDS = {"": "", "at_boundaries": ", with task ids"}
 """What is said of runs with another ``protocol.task_id`` than their curriculum has."""
 
 STUDIES = {
