@@ -1,0 +1,273 @@
+"""Methods against loss of plasticity, on tasks that each seed draws: plasticity.md."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from statistics import fmean
+from string import Template
+
+import numpy as np
+from scipy.stats import rankdata
+
+from ctgraph_rl.report import statistics
+from ctgraph_rl.report.statistics import Comparison
+from studies.raw import HERE, TEMPLATES, Raw, groups, machines, mean_of, read, shown, table
+from studies.verdicts import UNKNOWN
+
+NAME = "plasticity"
+MATCHED = "plasticity_matched"
+TRIALS = "plasticity_trials"
+PAGE = HERE / "plasticity.md"
+
+AREAS = (0.0, 1.0)
+ALPHA = 0.05
+
+CONFLICT = "goal_conflict"
+STREAM = "stream"
+
+NINE = {
+    "layer_norm": "layer norm",
+    "l2_init": "L2 init",
+    "shrink_and_perturb": "shrink and perturb",
+    "redo": "ReDo",
+    "continual_backprop": "continual backprop",
+    "parseval": "Parseval",
+    "c_chain": "C-CHAIN",
+    "fire": "FIRE",
+    "upgd": "UPGD",
+}
+LABELS = {"none": "*fine-tuning*", "fresh_optimiser": "a fresh Adam", **NINE, "fresh": "*a fresh network*"}
+
+CONTROLS = ("none", "fresh_optimiser", "fresh")
+"""Conditions with which all others are compared."""
+
+METRICS = {
+    "dormant_0.1": "dormant at 0.1",
+    "dormant_0.025": "dormant at 0.025",
+    "dead": "dead",
+    "rank_effective": "effective rank",
+    "rank_srank": "srank",
+    "rank_stable": "stable rank",
+}
+COLUMNS = [f"{name}_{images}" for name in METRICS for images in ("task", "fresh")] + ["norm_weights"]
+"""Metrics before a change; ranks and shares on the next task's images and on fresh ones."""
+
+RESAMPLES = 4000
+
+
+def later_blocks(curriculum: str, condition: str) -> dict[str, Raw]:
+    """Return the lines of all blocks but the first, by seed."""
+    lines = []
+    for line in read(NAME):
+        if (line["curriculum"], line["condition"]) == (curriculum, condition) and int(line["block"]) > 1:
+            lines.append(line)
+    return {seed: of_seed for (seed,), of_seed in groups(lines, "seed").items()}
+
+
+def area(lines: Raw) -> float:
+    """Return a seed's mean area over blocks."""
+    return fmean(float(line["area"]) for line in lines)
+
+
+def compared(curriculum: str, first: str, second: str) -> Comparison:
+    """Compare the areas of two conditions, paired by seed."""
+    ours = later_blocks(curriculum, first)
+    theirs = later_blocks(curriculum, second)
+    seeds = [seed for seed in ours if seed in theirs]
+    return statistics.compare(*([area(lines[seed]) for seed in seeds] for lines in (ours, theirs)))
+
+
+def nine_against(curriculum: str, other: str) -> dict[str, Comparison]:
+    """Compare the nine methods with another condition, with p-values by Holm over the nine."""
+    ran = [name for name in NINE if later_blocks(curriculum, name)]
+    return statistics.corrected({name: compared(curriculum, name, other) for name in ran})
+
+
+def conditions_table(curriculum: str) -> str:
+    """Return a row for each condition: area, share of blocks that reached 0.9, and differences paired by seed."""
+    rows = []
+    tested = nine_against(curriculum, "none")
+    for condition, label in LABELS.items():
+        of_seeds = later_blocks(curriculum, condition)
+        if not of_seeds:
+            continue
+        blocks = [line for lines in of_seeds.values() for line in lines]
+        reached = sum(line["reached"] == "True" for line in blocks)
+        row = [label, mean_of([area(lines) for lines in of_seeds.values()], AREAS), f"{reached} of {len(blocks)}"]
+        for other in CONTROLS:
+            row.append("" if condition == other else shown(compared(curriculum, condition, other).difference))
+        holm = tested[condition].holm if condition in tested else None
+        row.append("" if holm is None else f"{holm:.2g}")
+        rows.append(row)
+    head = ["condition", "area", "reached 0.9", *(f"less {LABELS[other].strip('*')}" for other in CONTROLS), "p"]
+    return table(head, rows)
+
+
+def better(curriculum: str, other: str = "none") -> str:
+    """Return the methods that Holm's procedure finds better than another condition, and worse, in words."""
+    parts = []
+    for word, sign in (("better", 1), ("worse", -1)):
+        names = []
+        for name, each in nine_against(curriculum, other).items():
+            if each.holm is not None and each.holm <= ALPHA and (each.difference.value or 0) * sign > 0:
+                names.append(NINE[name])
+        parts.append(f"{word}: {', '.join(names) or 'none'}")
+    return "; ".join(parts)
+
+
+def matched_table() -> str:
+    """Return a row for each curriculum: what the start costs, and what the weights cost."""
+    rows = []
+    for (curriculum, blocks), lines in groups(read(MATCHED), "curriculum", "blocks_before").items():
+        of = _areas(lines)
+        means = [mean_of(of[network], AREAS) for network in ("fresh", "distilled", "old")]
+        costs = [shown(each.difference) for each in _costs(lines).values()]
+        misses = len({line["seed"] for line in lines}) - len(of["distilled"])
+        rows.append([f"`{curriculum}`, after {blocks}", *means, *costs, str(misses)])
+    head = ["before the last task", "fresh", "distilled", "old", "cost of the start", "cost of the weights", "misses"]
+    return table(head, rows)
+
+
+def matched_words() -> str:
+    """Return for each curriculum whether the start, or the weights, cost something."""
+    parts = []
+    for (curriculum, blocks), lines in groups(read(MATCHED), "curriculum", "blocks_before").items():
+        costs = []
+        for name, each in _costs(lines).items():
+            decided = each.p_value is not None and each.p_value <= ALPHA
+            costs.append(f"{name} {shown(each.difference)}{'' if decided else f' ({UNKNOWN})'}")
+        parts.append(f"before block {int(blocks) + 1} of `{curriculum}` {', '.join(costs)}")
+    return "; ".join(parts)
+
+
+def _costs(lines: Raw) -> dict[str, Comparison]:
+    """Compare a fresh network with a distilled one, which shows the start, and that with the old one: the weights."""
+    of = _areas(lines)
+    return {
+        "the start": statistics.compare(of["fresh"], of["distilled"]),
+        "the old weights": statistics.compare(of["distilled"], of["old"]),
+    }
+
+
+def _areas(lines: Raw) -> dict[str, list[float]]:
+    """Return the areas of networks, one for each seed whose distillation met its limits."""
+    met = {line["seed"] for line in lines if line["network"] == "distilled" and line["met"] == "True"}
+    found: dict[str, list[float]] = {}
+    for line in lines:
+        if line["seed"] in met:
+            found.setdefault(line["network"], []).append(float(line["area"]))
+    return found
+
+
+def forecasts(curriculum: str) -> Mapping[str, tuple[float, float, float]]:
+    """Return each metric's rank correlation with the area after the change, and its interval.
+
+    Ranks are within conditions; seeds are drawn with replacement. Intervals are corrected by Bonferroni.
+    """
+    by_condition = []
+    for condition in LABELS:
+        lines = [line for of_seed in later_blocks(curriculum, condition).values() for line in of_seed]
+        if lines and condition != "fresh":
+            by_condition.append(lines)
+    seeds = [int(line["seed"]) for lines in by_condition for line in lines]
+    positions = np.unique(seeds, return_inverse=True)[1]
+    areas = _centred(by_condition, "area")
+    counts = np.random.default_rng(0).multinomial(
+        positions.max() + 1, np.full(positions.max() + 1, 1 / (positions.max() + 1)), RESAMPLES
+    )
+    weights = np.concatenate([np.ones((1, len(seeds))), counts[:, positions]])
+    found = {}
+    for column in COLUMNS:
+        values = _centred(by_condition, column)
+        scale = np.sqrt((weights @ values**2) * (weights @ areas**2))
+        correlations = (weights @ (values * areas)) / np.where(scale > 0, scale, np.inf)
+        tail = ALPHA / len(COLUMNS) / 2
+        low, high = np.quantile(correlations[1:], [tail, 1 - tail])
+        found[column] = (float(correlations[0]), float(low), float(high))
+    return found
+
+
+def _centred(by_condition: list[Raw], column: str) -> np.ndarray:
+    """Return ranks within each condition, less their mean, as shares of the condition's lines."""
+    parts = []
+    for lines in by_condition:
+        ranks = rankdata([float(line[column]) for line in lines])
+        parts.append((ranks - (len(lines) + 1) / 2) / len(lines))
+    return np.concatenate(parts)
+
+
+def forecast_table() -> str:
+    """Return a row for each metric with its rank correlations."""
+    rows = []
+    found = [forecasts(curriculum) for curriculum in (CONFLICT, STREAM)]
+    for column in COLUMNS:
+        rows.append([_name(column), *(_cell(of[column]) for of in found)])
+    return table(["before the change", f"`{CONFLICT}`", f"`{STREAM}`"], rows)
+
+
+def _cell(found: tuple[float, float, float]) -> str:
+    value, low, high = found
+    return f"{value:.2f} [{low:.2f}, {high:.2f}]"
+
+
+def forecast_words(curriculum: str) -> str:
+    """Return the metrics whose interval leaves 0 out, the strongest first, or that none can be named."""
+    seen = {column: each for column, each in forecasts(curriculum).items() if each[1] > 0 or each[2] < 0}
+    order = sorted(seen, key=lambda column: -abs(seen[column][0]))
+    return "; ".join(f"{_name(column)}, {seen[column][0]:.2f}" for column in order[:3]) or UNKNOWN
+
+
+def _name(column: str) -> str:
+    """Return what a metric is called."""
+    if column == "norm_weights":
+        return "norm of weights"
+    name, _, images = column.rpartition("_")
+    return f"{METRICS[name]}, {images} images"
+
+
+def trials_table() -> str:
+    """Return a row for each condition: what was tried, what was chosen, and its area on the tuning seeds."""
+    rows = []
+    for (condition,), lines in groups(read(TRIALS), "condition").items():
+        tried = groups([line for line in lines if int(line["block"]) > 1], "settings")
+        scores = {settings: area(of) for (settings,), of in tried.items()}
+        best = max(scores, key=lambda settings: scores[settings])
+        seeds = len({line["seed"] for line in lines})
+        rows.append([LABELS[condition], str(len(scores)), str(seeds), f"`{best}`", f"{scores[best]:.2f}"])
+    return table(["condition", "trials", "seeds", "chosen", "area"], rows)
+
+
+def seconds() -> float:
+    """Return the CPU minutes of all runs."""
+    runs = groups([*read(NAME), *read(TRIALS)], "curriculum", "condition", "settings", "seed")
+    return sum(float(lines[0]["seconds"]) for lines in runs.values()) / 60
+
+
+def page() -> str:
+    """Return the page: its template with its tables and numbers."""
+    text = (TEMPLATES / "plasticity.md").read_text(encoding="utf-8")
+    return Template(text).substitute(
+        better_conflict=better(CONFLICT),
+        better_stream=better(STREAM),
+        than_adam=better(CONFLICT, "fresh_optimiser"),
+        adam=shown(compared(CONFLICT, "fresh_optimiser", "none").difference),
+        conflict=conditions_table(CONFLICT),
+        stream=conditions_table(STREAM),
+        conflict_seeds=str(len(later_blocks(CONFLICT, "none"))),
+        stream_seeds=str(len(later_blocks(STREAM, "none"))),
+        loss_conflict=shown(compared(CONFLICT, "none", "fresh").difference),
+        loss_stream=shown(compared(STREAM, "none", "fresh").difference),
+        matched=matched_table(),
+        matched_words=matched_words(),
+        forecast=forecast_table(),
+        forecast_conflict=forecast_words(CONFLICT),
+        forecast_stream=forecast_words(STREAM),
+        trials=trials_table(),
+        minutes=f"{seconds():.0f}",
+        machines=machines(NAME, MATCHED, TRIALS),
+    )
+
+
+def make() -> None:
+    """Write the page."""
+    PAGE.write_text(page(), encoding="utf-8")
