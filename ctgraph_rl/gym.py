@@ -415,6 +415,7 @@ class StreamVectorEnv(CTGraphVectorEnv):
     ) -> None:
         made = curriculum_named("stream", **settings) if stream is None else stream
         require((isinstance(made, Stream), f"stream must be a Stream, got {made!r:.80}"), seed_rule(seed))
+        assert isinstance(made, Stream)
         self.stream = made.for_seed(seed)
         require(self.stream.blocks[0].frame_rule(num_envs, "a block"))
         self._optima = np.array([task.optimal_value(1.0) for task in self.stream.examples])

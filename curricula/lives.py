@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from ctgraph_rl.checks import as_tuple, by_name, require
 from ctgraph_rl.core.goal import Goal
@@ -110,7 +111,7 @@ def goal_conflict(num_frames: int = 98_304, depth: int = 3, num_tasks: int = 2, 
     return Stream("goal_conflict", 1, CONFLICT, life, how)  # type: ignore[arg-type]
 
 
-def _several(value: object) -> tuple[object, ...]:
+def _several(value: object) -> tuple[Any, ...]:
     listed = as_tuple(value)
     return listed if isinstance(listed, tuple) else (listed,)
 

@@ -50,6 +50,7 @@ def test_regret_is_told_where_an_episode_ends():
     assert found == {0.0, 2.0}
 
 
+@pytest.mark.slow
 def test_a_cleanrl_like_loop_learns_the_stream():
     """One linear layer and REINFORCE, a batch of steps at a time."""
     torch.manual_seed(0)

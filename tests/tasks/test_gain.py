@@ -46,24 +46,24 @@ def test_what_policies_lose_in_a_block_by_hand():
 
 def test_the_random_policy_loses_what_it_is_measured_to_lose():
     task = ct_fo_b1()
-    played = evaluate(RandomPolicy, [task], 20_000, seed=3)
+    played = evaluate(RandomPolicy, [task], 4000, seed=3)
     value = played["episode_reward"].double().mean().item()
     length = played["step_count"].double().mean().item()
 
     in_episodes, in_frames = lost_by_policies(task, 1000)["random"]
 
-    assert in_episodes == pytest.approx(1000 / length * (1 - value), rel=0.02)  # standard error 0.4%
-    assert in_frames == pytest.approx(1000 * (1 / 6 - value / length), rel=0.02)
+    assert in_episodes == pytest.approx(1000 / length * (1 - value), rel=0.04)  # standard error 1%
+    assert in_frames == pytest.approx(1000 * (1 / 6 - value / length), rel=0.04)
 
 
 def test_a_search_fails_as_often_as_it_is_measured_to():
     task = ct_fo_b1()
-    played = evaluate(SearchPolicy, [task], 5000, seed=3, episodes_per_row=5)
+    played = evaluate(SearchPolicy, [task], 2000, seed=3, episodes_per_row=5)
 
     failures = 5 - 5 * played["episode_reward"].double().mean().item()
 
     assert lost_by_policies(task, 5 * 6)["search"].in_episodes == 1.5
-    assert failures == pytest.approx(1.5, abs=0.15)  # standard error 0.035
+    assert failures == pytest.approx(1.5, abs=0.2)  # standard error 0.06
 
 
 def test_rewards_without_closed_forms_have_no_lines_of_search_and_memoryless_policies():

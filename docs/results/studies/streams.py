@@ -70,12 +70,12 @@ def claims() -> str:
     found = runs()
     rows = []
     for agent, name in AGENTS.items():
-        losses = [solved(line)[0] - solved(line)[-1] for line in found[agent, "finetune"]]
+        losses = [solved(line)[0] - solved(line)[-1] for line in found.get((agent, "finetune"), [])]
         rows.append(_claim(f"{name}, fine-tuned, solves fewer tasks in the last window than in the first", losses))
         for method in ("ewc", "mask_ri", "scratch"):
             gains = []
-            for line in found[agent, method]:
-                same = [each for each in found[agent, "finetune"] if each["seed"] == line["seed"]]
+            for line in found.get((agent, method), []):
+                same = [each for each in found.get((agent, "finetune"), []) if each["seed"] == line["seed"]]
                 if same:
                     gains.append(fmean(solved(line)) - fmean(solved(same[0])))
             rows.append(_claim(f"{name} solves more tasks with {METHODS[method]} than fine-tuned", gains))
