@@ -53,7 +53,7 @@ def test_the_page_shows_the_list_of_detectors_as_it_is_printed(capsys, monkeypat
     cli.main()
 
     assert printed == capsys.readouterr().out
-    assert printed.partition("\n\n")[2] in CHECKOUT.joinpath("docs/reference/detectors.md").read_text(encoding="utf-8")
+    assert printed.rpartition("\n\n")[2] in CHECKOUT.joinpath("docs/reference/detectors.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("name", YAML)
