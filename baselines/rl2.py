@@ -66,7 +66,6 @@ class TrialTrunk(TensorDictModuleBase):
         return self.trunk.of_histories(self._inputs(data)[0])
 
     def _inputs(self, data: Data) -> tuple[TensorsByName, Tensor]:
-        """Return the inner trunk's inputs, and the episode's number in its trial, from 1."""
         episode = data["trial"] + data["is_init"]
         fresh = data["is_init"] & ((episode == 1) | (episode > self.trial_episodes))
         inputs = {key: data[key] for key in (*self.trunk.in_keys, INPUT, HISTORY) if key != "previous" and key in data}

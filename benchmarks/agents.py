@@ -182,7 +182,6 @@ def table(measured: list[Contender]) -> str:
 
 
 def _solved(found: list[tuple[int, float] | None]) -> tuple[str, str]:
-    """Return median frames and seconds if most seeds solved the task, else how many did."""
     times = sorted(one for one in found if one is not None)
     if len(times) * 2 <= len(found):
         return (f"{len(times)} of {len(found)} seeds", "") if found else ("", "")

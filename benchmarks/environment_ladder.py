@@ -193,8 +193,6 @@ def _prepared(tasks: Sequence[Task], device: torch.device) -> tuple[Rows, Steps,
 
 
 def _replayed(region: Region, rows: Rows, actions: Tensor) -> TimedRun:
-    """Return a run of a region from rows' states to the states after its steps."""
-
     def run() -> int:
         rows.state = RowState(**region(rows.state._asdict()))
         return actions.numel()
@@ -269,7 +267,6 @@ def measure(rung: Rung, rounds: int, seconds: float, device: torch.device) -> No
 
 
 def _speed(run: TimedRun, at_once: int, seconds: float, device: torch.device) -> float:
-    """Return observations a second, waiting for the device after ``at_once`` runs."""
     count = 0
     start = finished(device)
     while (now := finished(device)) - start < seconds:

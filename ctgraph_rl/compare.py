@@ -191,7 +191,6 @@ def _same(one: Any, other: Any) -> bool:
 
 
 def _parts(line: LogLine) -> dict[str, NamedValues]:
-    """Return a first line's settings, curriculum, code and machine, by name."""
     left = dict(line)
     for key in ("kind", "seconds", "config"):
         left.pop(key, None)

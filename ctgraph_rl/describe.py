@@ -148,7 +148,6 @@ def _graphs(curriculum: Curriculum) -> Sequence[Task]:
 
 
 def _neighbours(stream: Stream) -> str:
-    """Return how alike tasks in a row are, by the measures of `ctgraph_rl.tasks.similarity`."""
     pairs = list(pairwise(stream.tasks[:MOST_SHOWN]))
     if not pairs:
         return "there is one task"
@@ -246,7 +245,6 @@ def _other_blocks(curriculum: Curriculum) -> Sheet:
 
 
 def _block_rows(number: int, block: Block, labels: Mapping[TaskLike, str]) -> Iterator[tuple[str, ...]]:
-    """A row per different task; the first has the block's facts."""
     name = str(number)
     frames = f"{block.num_frames:,}"
     switch = "" if block.switch is None else repr(block.switch)

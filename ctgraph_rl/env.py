@@ -216,7 +216,6 @@ class CTGraphEnv(EnvBase):
         return self._tensordict(self._data(shown.observation, shown.done.unsqueeze(-1), is_init.unsqueeze(-1), shown))
 
     def _read_state(self, tensordict: TensorDictBase | None, mask: Tensor | None) -> RowState:
-        """Return the state to restore in a mask's rows; refuse states that their trees lack."""
         given = TensorDict() if tensordict is None else tensordict.get("state", TensorDict())
         complete = set(RowState._fields) <= set(given.keys())
         require((complete, "set_state=True needs the rows' state under 'state', as get_state() gives it"))
@@ -318,7 +317,6 @@ class CTGraphEnv(EnvBase):
         return data
 
     def _step_or_start(self, action: Tensor | None, mask: Tensor | None) -> RowData:
-        """Step all rows but those whose episode has ended, which start another."""
         require((mask is None, "rows with hidden episodes step together: leave out _step"))
         over = self.rows.is_done
         if self.check_actions:
@@ -428,7 +426,6 @@ _SHARED = ("is_init", "terminated", "step_count", "episode_reward", "reward", "t
 
 
 def _own(data: RowData) -> RowData:
-    """Return data with separate memory, to be written into."""
     return {key: value.clone() if key in _SHARED else value for key, value in data.items()}
 
 

@@ -337,7 +337,6 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         return torch.from_numpy(action.astype(np.int64))
 
     def _start_streams(self, mask: RowMask, seed: int | Sequence[int | None] | None) -> None:
-        """Start random streams in a mask's rows that get a seed, and in all at first."""
         seeds: Any = (None,) * self.num_envs if seed is None else as_tuple(seed)
         if isinstance(seed, int) and is_int(seed, 0):
             super().reset(seed=seed)
@@ -367,7 +366,6 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
             self._next_numbers = self._numbers
 
     def _only(self, mask: RowMask, change: Callable[[], None]) -> None:
-        """Restrict a change that ends episodes to a mask's rows."""
         before = self.rows.state
         change()
         self.rows.state = choose(torch.from_numpy(mask), self.rows.state, before)
@@ -442,7 +440,6 @@ class StreamVectorEnv(CTGraphVectorEnv):
         return taken
 
     def _start_block(self) -> None:
-        """Give rows the next task, if a block ends here."""
         if self.stream.is_end(self._frames) and self._frames < self.stream.num_frames:
             self.set_tasks([self.stream.tasks[self.stream.block_at(self._frames)]] * self.num_envs)
 

@@ -91,7 +91,6 @@ def penn_a_swap(
 
 
 def _lives(goals: Tasks, num_lives: int, seed: int) -> tuple[list[Tasks], list[int]]:
-    """Draw the rows' tasks before and after the swap of each life, and the episodes before it."""
     source = generator(seed)
     count = len(goals)
     tasks = []

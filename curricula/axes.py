@@ -324,7 +324,6 @@ def _random_goal(graph: CTGraph, source: random.Random) -> tuple[int, ...]:
 
 
 def _with_room(images: ImageSet, num_images: int, exact: bool = False) -> ImageSet:
-    """A generated set of at least, or exactly, so many images; other sets unchanged."""
     settable = "num_images" in {field.name for field in fields(images) if field.init}  # type: ignore[arg-type]
     fits = images.num_images == num_images if exact else images.num_images >= num_images
     return images if fits or not settable else replace(images, num_images=num_images)  # type: ignore

@@ -250,13 +250,11 @@ def from_graph(
 
 
 def _several(value: object, usual: object = None) -> tuple[Any, ...]:
-    """Return one value or several as a tuple; the usual one for None."""
     listed = as_tuple(usual if value is None else value)
     return listed if isinstance(listed, tuple) else (listed,)
 
 
 def _shown(task: Task, ids: ReadOnlyValues) -> Observations:
-    """Return a task's observations with other ids; None: unchanged."""
     shown = task.observations
     given = {name: value for name, value in ids.items() if value is not None}
     if not given:
@@ -309,7 +307,6 @@ def _curriculum(
     switch_episodes: int,
     goal_change: int | Sequence[int] | None,
 ) -> Curriculum:
-    """Return tasks as blocks, or in one block with a switch or changing goals."""
     known = switch is None or switch in SWITCHES
     require(
         *at_least_one(repeats=repeats),

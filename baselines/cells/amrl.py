@@ -79,14 +79,12 @@ class AMRL(Cell):
 
     @override
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
-        """The aggregates are scans."""
         memory = self.inner.sequence(inputs, groups, starts, state[:2])
         x, y = memory.chunk(2, dim=-1)
         m, _ = self._aggregate(x, starts, state[2:])
         return self._output(m, y)
 
     def _aggregate(self, x: Tensor, starts: Tensor, state: CellState) -> CellOutput:
-        """Return m of x, [rows, steps, n] each, and the state after the last step."""
         if self.is_max:
             first = torch.maximum(state[0].unsqueeze(1), x[:, :1])
             m = max_scan(torch.cat([first, x[:, 1:].relu()], dim=1), starts)
@@ -105,7 +103,6 @@ class AMRL(Cell):
 
 
 def _sums(inputs: Tensor, starts: Tensor, state: Tensor) -> Tensor:
-    """Return sums of [rows, steps, n] inputs since the start of the episode, added to a state."""
     first = state.unsqueeze(1) + inputs[:, :1]
     carry = (~starts).unsqueeze(-1).to(inputs.dtype)
     return linear_scan(carry, torch.cat([first, inputs[:, 1:]], dim=1))

@@ -93,7 +93,6 @@ class Attention(Cell):
 
     @override
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
-        """All steps at once, each over the frames of its episode."""
         present = of_frames(inputs, groups)
         frames = torch.cat([state[0][..., :-1], present], dim=1)
         episode = number_episodes(starts)

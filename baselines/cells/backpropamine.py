@@ -86,7 +86,6 @@ class Backpropamine(Cell):
 
     @override
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
-        """Inputs are multiplied with their weights once a group."""
         given = of_frames(self.input(inputs), groups.T)
         resets = [start.nonzero().squeeze(-1) for start in starts.unbind(1)]
         resets[0] = resets[0][:0]  # zero already
@@ -108,7 +107,6 @@ class Backpropamine(Cell):
         )
 
     def _step(self, given: Tensor, state: CellState, product: Tensor | None = None) -> CellOutput:
-        """Take a step from the inputs times their weights, [rows, H]; ``product`` is overwritten."""
         before, hebb, *traces = state
         fast = torch.mul(self.plasticity, hebb, out=product)
         units = (given + before @ self.recurrent + columns_times(before, fast)).tanh()

@@ -71,7 +71,6 @@ class Frames(Cell):
 
     @override
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
-        """A frame counts if no episode has started since."""
         frames = torch.cat([state[0], of_frames(inputs, groups)], dim=1)
         episode = number_episodes(starts)
         earlier = episode.new_zeros(len(starts), self.num_frames - 1)

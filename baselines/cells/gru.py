@@ -44,7 +44,6 @@ class GRU(Cell):
 
     @override
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
-        """The GRU runs over all segments between resets at once."""
         step = partial(gru_step, self.gru)
         return segments(starts).run(step, gru_inputs(self.gru, inputs), groups, state)
 

@@ -45,7 +45,6 @@ class LSTM(Cell):
 
     @override
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
-        """The LSTM runs over all segments between resets at once."""
         if not starts[:, 1:].any():
             output, _ = self.lstm(of_frames(inputs, groups), _layer_first(state))
             return output
@@ -62,7 +61,6 @@ class LSTM(Cell):
 
 
 def _layer_first(state: CellState) -> CellState:
-    """Return a state as PyTorch's LSTM takes it, [1, rows, num_outputs] each."""
     return tuple(value.transpose(0, 1).contiguous() for value in state)
 
 

@@ -36,7 +36,6 @@ class MinGRU(Cell):
 
     @override
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
-        """A scan, in which a reset is a carry of 0."""
         carry, given = self._parts(inputs)
         carry = of_frames(carry, groups)
         given = of_frames(given, groups)
@@ -45,6 +44,5 @@ class MinGRU(Cell):
         return linear_scan(carry * goes_on, torch.cat([first, given[:, 1:]], dim=1))
 
     def _parts(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the state's factor, and what is added to it."""
         gate = self.gate(inputs)
         return (-gate).sigmoid(), gate.sigmoid() * self.candidate(inputs)

@@ -108,14 +108,12 @@ class ADWIN(Detector):
         """Whether each row's present episode began with the label, bool [rows]; None: before the first batch."""
 
     def _ended(self, seen: Seen) -> list[float]:
-        """Return the returns of ended episodes that began with the label, row after row."""
         before = torch.zeros(len(seen.done), dtype=torch.bool, device="cpu") if self.is_whole is None else self.is_whole
         is_whole = before.unsqueeze(1) | (seen.is_init.cumsum(dim=1) > 0)
         self.is_whole = is_whole[:, -1].clone()
         return seen.episode_return[seen.done & is_whole].tolist()
 
     def _falls(self, episode_return: float) -> bool:
-        """Add a return; if the window was cut and its mean has fallen, keep the rest and return True."""
         self.window.update(episode_return)
         self.returns.append(episode_return)
         if not self.window.drift_detected:

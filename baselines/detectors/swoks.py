@@ -170,7 +170,6 @@ class SWOKS(Detector):
         return self.label if enough and self._p_value(earlier, newest) > self.accept else None
 
     def _suspicion(self) -> Verdict:
-        """Return a suspicion if the present label's distances have grown, after storing what the label keeps."""
         distances = self.distances[self.label]
         if self.num_points <= self.stable_phase or len(distances) <= self.num_left_out:
             return None

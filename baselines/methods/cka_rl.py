@@ -68,7 +68,6 @@ class CKARL(TaskMethod):
 
     @override
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        """The optimiser now trains w_base + v_k and alpha."""
         super().setup(agent, weights, curriculum)
         names = weights.names if self.scope == "all" else head_names(agent.policy, without="state_value")
         self.inside = [name in names for name in weights.names]

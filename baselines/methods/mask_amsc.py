@@ -101,7 +101,6 @@ class MaskAMSC(SelectedMasks):
         self.competence[self.slot] = min(max(found, 0.0), 1.0)
 
     def _trained(self) -> float:
-        """Return the mean return of the episodes that ended in the last batches, or 0."""
         total = sum(returns for returns, _ in self.returns)
         number = sum(count for _, count in self.returns)
         return total / max(number, 1)

@@ -141,7 +141,6 @@ class PackNet(TaskMethod):
         self.agent.weights_changed()
 
     def _kept_up_to(self, slot: int) -> Tensor:
-        """Return where the tasks up to this slot keep weights, bool [P]."""
         return (self.owner >= 0) & (self.owner <= slot)
 
     def _on_device(self, chosen: Tensor) -> Tensor:

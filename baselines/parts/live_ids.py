@@ -54,14 +54,12 @@ def only_live_ids(learner: Trained, shown: Tensor) -> Iterator[None]:
 
 
 def _leaves_others(learner: Trained, shown: Tensor) -> bool:
-    """Return whether steps change no weight without a gradient."""
     is_plain = type(learner.method) is Hooks and type(learner.plasticity) is PlasticityHooks
     decays = any(group["weight_decay"] for group in learner.optimiser.param_groups)
     return shown.is_cpu and is_plain and learner.compiled_step is None and has_parts(learner.optimiser) and not decays
 
 
 def _encoders(learner: Trained) -> list[Encoder]:
-    """Return the encoders with many ids that the optimiser trains, and those of targets."""
     found = []
     for module in learner.modules():
         if isinstance(module, Encoder) and module.num_ids >= MANY_IDS:
@@ -72,8 +70,6 @@ def _encoders(learner: Trained) -> list[Encoder]:
 
 
 class _Table:
-    """The first matrix of an encoder, with the optimiser's moments."""
-
     def __init__(self, encoder: Encoder, optimiser: torch.optim.Optimizer) -> None:
         self.encoder = encoder
         self.weight = encoder.linear.weight

@@ -274,7 +274,6 @@ class QLearner(Learner):
 
     @override
     def shown_ids(self, batch: TensorDictBase) -> Tensor | None:
-        """Those of the batch and of all that replay can give."""
         shown = super().shown_ids(batch)
         if shown is None or not len(self.replay):
             return shown

@@ -125,7 +125,6 @@ class RecurrentQ(QLearner):
         return pad(self._inputs(batch), [0, 0, 0, missing]).update(pad(steps, [0, 0, 0, missing + 1]))
 
     def _inputs(self, batch: TensorDictBase) -> TensorDictBase:
-        """Return the network's inputs at all steps and after the last one."""
         keys = self.trunk.in_keys
         last = batch["next"][:, -1:].select(*keys)
         return torch.cat([batch.select(*keys), last], dim=1)

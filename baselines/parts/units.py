@@ -134,7 +134,6 @@ def activations(policy: nn.Module, data: Data) -> Activations:
 
 
 def _heads(policy: nn.Module, trunk: Any) -> list[nn.Module]:
-    """Return the modules that read a trunk's outputs."""
     found: list[nn.Module] = []
     for part in policy.modules():
         if isinstance(part, TensorDictModule) and not isinstance(part, TensorDictSequential):
@@ -168,6 +167,5 @@ def _keep(values: list[Tensor], module: nn.Module, arguments: Any, output: Tenso
 
 
 def _shares(numbers: Tensor) -> Tensor:
-    """Return the share of each number from 0, [n]."""
     counts = numbers.bincount()
     return counts.to(torch.float32) / counts.sum()

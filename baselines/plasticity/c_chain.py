@@ -97,7 +97,6 @@ class CChain(Plasticity):
         return {**batch, **{("churn", key): value for key, value in added.items()}}
 
     def _draw(self, count: int) -> Items:
-        """Return the inputs of a minibatch of other frames, or rows."""
         agent = self.agent
         if isinstance(agent, QLearner):
             places = torch.randint(len(agent.replay), [count], generator=self.generator, device="cpu")

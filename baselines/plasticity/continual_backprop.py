@@ -81,7 +81,6 @@ class ContinualBackprop(Recycling):
         return {**measured, "recycled": measured["grad_norm"].new_tensor(count)}
 
     def _least_useful(self, utility: Tensor) -> Tensor:
-        """Return the units to recycle, bool [U]."""
         mature = self.age > self.maturity
         chosen = torch.zeros_like(mature)
         parts = [each.split(self.sizes) for each in (mature, utility, chosen)]

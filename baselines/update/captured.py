@@ -158,7 +158,6 @@ class CapturedGroup(SeedGroup):
             self._words = self.draws.words(1).flatten().tolist()
 
     def _task_has_changed(self) -> None:
-        """Read what a task's start changed into the graphs' memory; methods' graphs are new."""
         if self.methods:
             super()._task_has_changed()
             self._region = Region(self._usual_update)
@@ -202,7 +201,6 @@ class CapturedGroup(SeedGroup):
 
     @override
     def learnt(self, batch: TensorDictBase) -> list[Learnt]:
-        """The host waits twice."""
         for method, part in zip(self.methods, batch.chunk(len(self.learners)), strict=False):
             method.on_batch(part)
         steps = []

@@ -95,7 +95,6 @@ class SeedGroup:
         return self._agents
 
     def _task_has_changed(self) -> None:
-        """Forget what depends on the task, as methods' computations can."""
         self._stacks = []
         self._acting = self._outputs = None
 
@@ -177,7 +176,6 @@ class SeedGroup:
         return self._compiled[graph.code]
 
     def _sampled(self, outputs: Mapping[str, Tensor]) -> TensorsByName:
-        """Return random actions from each agent's generator."""
         noise = torch.empty_like(outputs["log_probs"], memory_format=torch.contiguous_format)
         for row, generator in zip(noise, self.generators, strict=True):
             row.exponential_(generator=generator)

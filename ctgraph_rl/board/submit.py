@@ -114,7 +114,6 @@ def _found(paths: Sequence[Path], only: ReadOnlyValues) -> list[Run]:
 def _checked(
     runs: Sequence[Run], experts: Mapping[int, Mapping[int, Path]], method: ReadOnlyValues, of_track: Track | None
 ) -> Curriculum:
-    """Return what runs learned; refuse them with every broken rule."""
     seeds = [run.seed for run in runs]
     rules = [*same_rules(runs), *code_rules(runs), *failure_rules(runs, method["failed"])]
     rules += seed_rules(seeds, method["tuning"]["seeds"], of_track)
@@ -218,7 +217,6 @@ def code_rules(runs: Sequence[Run]) -> Iterator[Rule]:
 
 
 def _code_now(about: ReadOnlyValues) -> NamedValues:
-    """Return the code of this process for the parts that a run's log names; None for what is not found."""
     stored = about.get("sources") or {}
     found = find_sources(stored.keys() - {*SCRIPTS})
     sources = {**dict.fromkeys(stored), **found} if about.get("sources") is not None else None

@@ -218,7 +218,6 @@ def _is_value(setting: str) -> bool:
 
 
 def _in_words(rung: Sequence[str]) -> str:
-    """Return a rung as ``depth 2, expected length 10``."""
     words = []
     for setting in rung:
         key, _, value = setting.rpartition(".")[2].partition("=")

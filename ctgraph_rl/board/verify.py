@@ -311,8 +311,6 @@ def verify(submission: Submission, arguments: argparse.Namespace) -> list[Check]
 
 @contextmanager
 def _ended_by_signals(message: str) -> Iterator[None]:
-    """Turn a signal to stop into an exception, so that processes are ended, and print why."""
-
     try:
         with sigterm_exits():
             yield

@@ -113,7 +113,6 @@ class Exchanging(SessionCoupling):
 
     @override
     def resume(self, members: Sequence[RunMember]) -> Sequence[RunState | None]:
-        """Return the states to resume from."""
         self.checkpoints.tidy()
         self.saved = self.checkpoints.newest()
         return [None] * len(members) if self.saved is None else self.saved["members"]
@@ -122,7 +121,6 @@ class Exchanging(SessionCoupling):
     def learn(
         self, members: Sequence[RunMember], saved: Sequence[RunState | None], console: Console | None
     ) -> Failures:
-        """Let all members learn; return those that failed."""
         done = 0 if self.saved is None else self.saved["frames"]
         total = sum(member.curriculum.num_frames for member in members)
         blocks = max(len(member.curriculum.blocks) for member in members)
@@ -143,7 +141,6 @@ class Exchanging(SessionCoupling):
 
     @override
     def end(self, members: Sequence[RunMember], failed: Failures) -> None:
-        """Write the collective's results."""
         write_summary(self.run_dir)
         self.checkpoints.clear()
 

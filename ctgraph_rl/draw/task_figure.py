@@ -86,8 +86,6 @@ def draw_task(
 
 
 class _TaskPicture:
-    """The arguments of `draw_task`, laid out on the axes."""
-
     def __init__(self, axes: Any, task: Task, visits: Counted, policy: PerAction, values: PerAction, ids: bool) -> None:
         self.axes = axes
         self.task = task
@@ -124,7 +122,6 @@ class _TaskPicture:
         return -min(y for _, y in self.places.values())
 
     def _sizes(self) -> tuple[float, float]:
-        """Return the width of marks and the distance between end states, in points."""
         box = self.axes.get_window_extent()
         points = 72 / self.axes.figure.dpi
         beside = points * box.width / len(self.layout.leaves)
@@ -267,7 +264,6 @@ class _TaskPicture:
                 self._note(numbers, place, shift, va=beside, fontsize=6, color=colour(FAIL))
 
     def _wrong(self, state: Key) -> list[int]:
-        """The actions that fail in a state, also those above b, of a curriculum's other tasks."""
         b = self.graph.branching_factor
         right = (WAIT_ACTION,) if state[0] == WAIT else range(1, b + 1)
         most = max(b + 1, len(self.policy.get(state, ())), len(self.values.get(state, ())))
@@ -300,7 +296,6 @@ class _TaskPicture:
         )
 
     def _room(self) -> float:
-        """Return the axes' inches of the figure."""
         spec = self.axes.get_subplotspec()
         return float(self.axes.figure.get_figwidth() / (1 if spec is None else spec.get_gridspec().ncols))
 

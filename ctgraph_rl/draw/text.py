@@ -32,7 +32,6 @@ def as_text(tasks: Sequence[Task], state: RowState, observation: Tensor, white: 
 
 
 def _place(task: Task, kind: int, node: int, goal_leaf: int, step_count: int) -> str:
-    """Return a place by branches and swaps: ``wait state after 1.2, step 4, goal 1.1``."""
     graph = task.graph
     goal = write_goal(graph.path(graph.num_decision_states + goal_leaf))
     way = f" after {write_goal(graph.path(node))}" if node else ""

@@ -211,7 +211,6 @@ def _acts_on_tensors(policy: Policy) -> bool:
 
 
 def _is_captured(env: EnvBase, policy: Policy) -> bool:
-    """Return whether steps run as a CUDA graph: those of a ``capturable`` policy."""
     is_known = type(env) is CTGraphEnv and not env.hides_episodes
     return is_known and getattr(policy, "capturable", False) and captures(env.device)
 

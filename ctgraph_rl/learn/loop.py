@@ -323,7 +323,6 @@ class Lockstep:
         return agent.policy_for(task)
 
     def _end_segment(self, segment: Segment) -> None:
-        """Notify the agents that a segment ended, if it has, and evaluate them."""
         if self.frames == segment.end <= self.last_learned:
             self.group.end_task()
         self._evaluate(self.frames)

@@ -138,7 +138,6 @@ class ProgressBar(TextBar):
 
 
 def _short(number: float) -> str:
-    """A count with at most four digits: 960, 20.48k, 1.638M."""
     for unit, size in (("M", 1e6), ("k", 1e3)):
         if number >= size:
             return f"{number / size:.4g}{unit}"

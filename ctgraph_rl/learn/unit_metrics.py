@@ -185,7 +185,6 @@ class UnitMeter:
 
     @torch.no_grad()
     def _activations(self, images: Tensor, task: Task) -> LayersByName:
-        """Return the activations at images, at the first step of an episode."""
         data = ShownTask(task, self._shape, shown_id(self.curriculum, task)).data(images, True)
         data |= self.agent.initial_state(len(images)).items()
         learner: Any = getattr(self.agent, "unwrapped", self.agent)

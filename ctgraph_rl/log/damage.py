@@ -50,7 +50,6 @@ _CHECKS: dict[str, Callable[[Path], bool]] = {LOG: _is_log, CURRICULUM: _is_json
 
 
 def _is_readable(path: Path, check: Callable[[Path], bool]) -> bool:
-    """Return whether a file passes a check; all but the log may be missing."""
     try:
         return path.is_file() and check(path) if path.exists() or path.name == LOG else True
     except (OSError, ValueError, RecursionError):

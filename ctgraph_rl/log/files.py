@@ -144,7 +144,6 @@ class Locks:
 
 
 def _lock(path: Path, folder: Path, waiting: Callable[[], object] | None) -> BinaryIO:
-    """Return the open, locked file, which names no other held lock."""
     while True:
         file = open_own(path, "ab+")
         try:
@@ -189,7 +188,6 @@ def _read(file: BinaryIO) -> bytes:
 
 
 def _holder(file: BinaryIO) -> str:
-    """Who has signed a lock file, and what to do."""
     signature = b""
     for _ in range(ATTEMPTS_TO_READ):  # it is signed right after it is locked
         signature = _read(file)
@@ -206,7 +204,6 @@ def _signature() -> str:
 
 
 def _is_locked(file: BinaryIO) -> bool:
-    """Lock the file, unless another process has done so."""
     import fcntl
 
     try:

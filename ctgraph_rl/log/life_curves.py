@@ -105,8 +105,6 @@ def _training(log: RunLog, count: int) -> Tensor:
 
 
 class _Seen(NamedTuple):
-    """As of `LifeCurves`."""
-
     moments: Tensor
     returns: Tensor
     success: Tensor

@@ -36,7 +36,6 @@ def _is_text(value: object) -> bool:
 
 
 def _are(holds: Callable[[Any], bool], value: object) -> bool:
-    """Whether it is a list of values that obey a rule."""
     return isinstance(value, list) and all(map(holds, value))
 
 
@@ -49,7 +48,6 @@ def _are_blocks(value: object) -> bool:
 
 
 def _are_sources(value: object) -> bool:
-    """Whether it has a text or None by module."""
     values = value.values() if isinstance(value, Mapping) else [] if value is None else [0]
     return all(each is None or isinstance(each, str) for each in values)
 

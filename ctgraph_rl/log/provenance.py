@@ -114,7 +114,6 @@ def learners(config: ReadOnlyValues | None, agent: object) -> list[str]:
 
 
 def _parts(value: Any) -> Iterator[str]:
-    """Yield the names of users' classes of a curriculum's parts."""
     if is_dataclass(value) and not isinstance(value, type):
         if not is_ours(type(value).__module__):
             yield full_name(type(value))

@@ -394,7 +394,6 @@ class RunLog:
         return RegimeTable([*names], Column(*zip(*rows, strict=True)), _row(values))
 
     def _stays(self, tasks: Sequence[int]) -> Iterator[tuple[int, bool, list[float | None]]]:
-        """Yield each regime's task number, whether it trains, and its returns."""
         at_end: dict[int, list[NamedValues]] = {}
         for m in self._evaluations(during=False):
             at_end.setdefault(m["block"], []).append(m)
@@ -427,7 +426,6 @@ class RunLog:
         return found
 
     def _matrix(self, rows: Iterable[Mapping[int, float | None]], num_tasks: int) -> Tensor:
-        """Rows of values by task number, else NaN."""
         evaluated = {m["task"] for m in self._evaluations(during=True)}
         tasks = range(1, max(num_tasks, 1 + max(chain(*self._said()), default=-1), *evaluated) + 1)
         rows = list(rows)

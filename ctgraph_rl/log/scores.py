@@ -319,7 +319,6 @@ def _mastery_curves(log: RunLog, curriculum: Curriculum, returns: Curves) -> Cur
 
 
 def _known(value: Callable[[Task, float], float], task: Task) -> float:
-    """An undiscounted value; NaN where the graph is too large."""
     try:
         return value(task, 1.0)
     except ValueError:
@@ -432,7 +431,6 @@ def _areas(
 
 
 def _check_stages(curves: Curves, least: int) -> None:
-    """Raise `Undefined` for a task whose own block has fewer evaluations."""
     for task in range(curves.performance.shape[1]):
         count = len(curves.own_stage(task))
         if count < least:

@@ -109,7 +109,6 @@ def _is_installed(spec: ModuleSpec) -> bool:
 
 
 def _installed(package: str) -> dict[str, str | None]:
-    """Return an installed package's version, None for what is nowhere; else nothing."""
     spec = _top(package)
     if spec is None:
         return {package: None}
@@ -123,7 +122,6 @@ def _installed(package: str) -> dict[str, str | None]:
 
 
 def _module(name: str, spec: ModuleSpec) -> Module:
-    """Return a module; an imported one as first read since."""
     imported = getattr(sys.modules.get(name), "__spec__", None)
     if imported is not None and name in _READ and _READ[name][0] is imported:
         return _READ[name][1]
@@ -169,7 +167,6 @@ def _of_script(name: str) -> Module | None:
 
 
 def _needed(statements: Iterable[ast.stmt], name: str) -> list[ast.stmt]:
-    """Return the statements that define a name or what they mention, in order."""
     mentions = {each: {node.id for node in ast.walk(each) if isinstance(node, ast.Name)} for each in statements}
     defines = {each: set(_defined(each)) for each in mentions}
     wanted = {name}

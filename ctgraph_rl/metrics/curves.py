@@ -314,7 +314,6 @@ def find_returns(trained: Sequence[Sequence[int]]) -> list[tuple[int, int, int]]
 
 
 def _frames_to(needed: Tensor, curves: Curves, block: int, task: int) -> float:
-    """Frames of a block until a task's first evaluation as good as needed, or NaN."""
     rows = curves.of_block(block)
     before = curves.of_block(block - 1)
     if block > 1 and not before:

@@ -181,7 +181,6 @@ def _pairs(number: int) -> int:
 
 
 def _delays(labelling: Labelling) -> Tensor:
-    """Return the frames from each change to its first alarm, float64 [changes], or NaN."""
     labelling.check_hidden()
     labelling.check_one_task_each()
     ends = labelling.frames.cumsum(0)

@@ -132,7 +132,6 @@ def search_efficiency(
 
 
 def _at_first_success(counts: Sequence[Tensor], episodes: Sequence[Tensor], success_rates: Sequence[Tensor]) -> Tensor:
-    """Each task's count at the first success, float64 [tasks], or NaN."""
     first = []
     for count, played, rates in zip(counts, episodes, success_rates, strict=True):
         found = (rates > 0).nonzero().flatten().tolist()

@@ -165,7 +165,6 @@ def adaptation_area(life: LifeCurves) -> Tensor:
 
 
 def _retention(life: LifeCurves, lag: int) -> Tensor:
-    """Return the windows' sums of returns ``lag`` blocks later, over the sum of all at the ends of their blocks."""
     if len(life.success) <= lag:
         raise Undefined(f"the life has {len(life.success)} blocks, and none is {lag} blocks after another")
     start = torch.full([lag], torch.nan, dtype=torch.float64, device="cpu")

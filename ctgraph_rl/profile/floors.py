@@ -72,7 +72,6 @@ def _best_by_step(branching_factor: int, wait_prob: float, goal: tuple[int, ...]
 
 
 def _improve(decisions: list[int], wait_prob: float, goal: tuple[int, ...]) -> float:
-    """Choose each step's decision in turn, with all others fixed; return the probability of success."""
     depth = len(goal)
     num_steps = len(decisions)
     later = [[0.0] * depth for _ in range(num_steps + 2)]  # success from the wait state of a level, by step

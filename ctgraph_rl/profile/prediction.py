@@ -50,8 +50,6 @@ class KnownBits(NamedTuple):
 
 
 class _Episodes(NamedTuple):
-    """Episodes side by side, [rows, steps]."""
-
     data: TensorDictBase
     seen: Tensor  # number of the image before the step, int64
     pair: Tensor  # number of the pair of image and reward after it, int64

@@ -255,7 +255,6 @@ def _lines(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[Measure
 
 
 def _metric(by_seed: BySeed, name: str, bounds: BoundsOfRuns, kind: str) -> Estimate:
-    """Return a metric over seeds; a time as its median, infinite for a seed that never got there."""
     values = _values(by_seed, name)
     defined = metrics.METRICS.get(name)
     if defined is not None and defined.is_time:

@@ -435,7 +435,6 @@ def _nothing(missing: int, method: str, reason: str = "no seed has a value") -> 
 
 
 def _of_tasks(values: Sequence[Values], who: str, level: float, resamples: int) -> tuple[list[list[float]], int, int]:
-    """Return the values of each task, and the least seeds with and the most without one."""
     require(*fraction(level=level), (is_int(resamples, 100), f"resamples must be an integer >= 100, got {resamples!r}"))
     require((len(values) > 0, f"{who} needs the values of at least one task"))
     known, missing = zip(*map(_known, values), strict=True)

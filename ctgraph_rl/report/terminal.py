@@ -143,7 +143,6 @@ def _tasks(name: str, history: History, curves: Mapping[str, str]) -> Table:
 
 
 def _life(name: str, run: Run) -> Table:
-    """Return a line for each window of a stream: its terms of the metrics."""
     table = Table(title=_text(f"{name}: means over windows of tasks"))
     table.add_column("window", no_wrap=True)
     for metric in IN_WINDOWS:

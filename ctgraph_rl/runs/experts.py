@@ -137,7 +137,6 @@ def find_or_train(
 
 
 def _left(run_dirs: RunDirs, what: str, tell: Callable[[str], object]) -> dict[int, Path]:
-    """Return untrained ones, and tell of each."""
     left = _untrained(run_dirs)
     for seed, run_dir in run_dirs.items():
         of_seed = f" of seed {seed}" if len(run_dirs) > 1 else ""

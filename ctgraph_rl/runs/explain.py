@@ -83,7 +83,6 @@ def explain(error: BaseException, cfg: DictConfig | None = None) -> str:
 
 
 def _first(error: OmegaConfBaseException) -> OmegaConfBaseException:
-    """Return OmegaConf's first error, which others were made of."""
     first = error
     each: BaseException | None = error
     while isinstance(each, OmegaConfBaseException):
@@ -166,7 +165,6 @@ def _says_what_to_do(error: BaseException) -> bool:
 
 
 def _unresolved(cfg: DictConfig) -> NamedValues:
-    """Return a configuration, without Hydra's part, as plain values with unresolved interpolations."""
     values: NamedValues = OmegaConf.to_container(cfg, resolve=False)  # type: ignore[assignment]
     values.pop("hydra", None)
     return values

@@ -71,7 +71,6 @@ class Interrupt:
         raise SystemExit(128 + self.signal)
 
     def _ask(self, number: int, frame: FrameType | None) -> None:
-        """Remember the first signal; the next acts as before."""
         self.signal = number
         self._restore()
         print(f"\n{signal.Signals(number).name}: saving after this update ... ", end="", file=sys.stderr, flush=True)

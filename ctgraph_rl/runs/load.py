@@ -122,7 +122,6 @@ def _builder(
     make_method: Callable[[], MethodLike] | None,
     curriculum: Curriculum,
 ) -> MakeAgent:
-    """Return what builds the agent with its method; the curriculum is prepared for it."""
     stored = {part: config.get(part) for part in OURS}
     named = make_agent is None
     alone = _ours(run_dir, "agent", stored["agent"]) if named else _with(run_dir, make_agent, stored["agent"])
@@ -139,7 +138,6 @@ def _builder(
 
 
 def _labelled(run_dir: Path, make_method: Callable[[], MethodLike], detector: Any) -> MethodLike:
-    """Return a new method, labelled by the stored detector unless it is already."""
     method = make_method()
     if detector is None or hasattr(method, "detector"):
         return method
@@ -148,7 +146,6 @@ def _labelled(run_dir: Path, make_method: Callable[[], MethodLike], detector: An
 
 
 def _with(run_dir: Path, make: Any, stored: Any) -> Callable[..., Any]:
-    """Return a class with the stored settings that it takes; another function unchanged."""
     if not (isinstance(make, type) and isinstance(stored, Mapping)):
         return make
     takes = parameters_of(make)
@@ -179,7 +176,6 @@ def _settings(run_dir: Path, stored: ReadOnlyValues) -> NamedValues:
 
 
 def _weights(run_dir: Path, log: RunLog) -> tuple[ReadOnlyValues, int]:
-    """Return the agent's state at the end, or at the last checkpoint, and its frames."""
     if (run_dir / AGENT).exists():
         return _checked(run_dir / AGENT), log.ends()[-1]
     saved = Checkpoints(run_dir / CHECKPOINTS).newest()
@@ -190,7 +186,6 @@ def _weights(run_dir: Path, log: RunLog) -> tuple[ReadOnlyValues, int]:
 
 
 def _checked(path: Path) -> Any:
-    """Return the content of a file of `torch.save`, if its sums agree and it is plain."""
     try:
         content = read_content(path)
         require_records(content)

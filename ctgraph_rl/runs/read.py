@@ -286,7 +286,6 @@ def find_runs(
 
 
 def _tuning_notes(runs: Sequence[Run]) -> Iterator[Problem]:
-    """Yield a sentence on the tuning runs of each agent and share."""
     for (name, agent, share), some in split_by(runs, _tuned).items():
         trials = len({run.alike for run in some})
         seeds = listed(sorted({run.seed for run in some}), MOST_SEEDS)
@@ -367,7 +366,6 @@ def _about(file: Path) -> NamedValues:
 
 
 def _agent(config: ReadOnlyValues) -> str | None:
-    """Return agent, unusual cell, method, plasticity and detector, by classes or the recorder's names."""
     learner = config.get("agent")
     agent = called(learner) or called(config.get("learner"))
     cell = called(learner.get("cell")) if isinstance(learner, Mapping) else None
@@ -480,7 +478,6 @@ def histories(runs: Iterable[Run]) -> list[History]:
 
 
 def _place(run: Run | None) -> float:
-    """Return a run's agent's place; agents without one come last."""
     return math.inf if run is None or run.shown is None else run.shown[0]
 
 

@@ -312,7 +312,6 @@ class OneBatch(SessionCoupling):
 
 
 def _same_group(member: RunMember) -> Rule:
-    """The rule that a run resumes with the seeds that it began with."""
     before = (RunLog.begun(member.run_dir / LOG) or {}).get("together", [])
     how = "together=true and seed=" + ",".join(map(str, before)) if before else "together=false"
     began = f"{member.run_dir} was begun {f'with the seeds {before} together' if before else 'by itself'}"
@@ -320,7 +319,6 @@ def _same_group(member: RunMember) -> Rule:
 
 
 def _all_begun(member: RunMember, others: Sequence[RunMember]) -> Rule:
-    """The rule that no run of a group has lost its checkpoints."""
     named = ", ".join(str(each.run_dir) for each in others)
     lost = f"{member.run_dir} has lost its checkpoints, and learns as one batch with {named}, which have some"
     return not others, f"{lost}: restore them, or start all again with overwrite=true"

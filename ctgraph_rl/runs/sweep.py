@@ -160,7 +160,6 @@ class Sweeper(Base):
             Sweeper.done = list(cells)
 
     def _combined(self, variant: ReadOnlyValues, arguments: Sequence[str]) -> list[list[str]]:
-        """Return all combinations of a variant with what is swept; a setting's last value counts."""
         own = [f"{key}={value}" for key, value in variant.items()]
         assert self.hydra_context is not None
         parser = OverridesParser.create(config_loader=self.hydra_context.config_loader)
@@ -173,11 +172,6 @@ class Sweeper(Base):
         return batch
 
     def _check_glob(self, parsed: Override) -> None:
-        """Refuse a pattern that chooses no file.
-
-        Raises:
-            ValueError: names the existing files.
-        """
         assert self.hydra_context is not None
         group = parsed.key_or_group
         names = self.hydra_context.config_loader.get_group_options(group)
@@ -229,11 +223,6 @@ class Sweeper(Base):
         return found
 
     def _composed(self, overrides: Overrides, choices: Overrides) -> DictConfig:
-        """Return the configuration of a cell.
-
-        Raises:
-            ValueError: for an unknown setting; names the cell's choices.
-        """
         assert self.config is not None and self.hydra_context is not None
         try:
             return self.hydra_context.config_loader.load_sweep_config(self.config, list(overrides))
@@ -263,7 +252,6 @@ class Sweeper(Base):
         self._num_unknown += unknown
 
     def _value(self, setting: str) -> tuple[str, Any] | None:
-        """Return a setting's key and value; None for one that chooses a file, adds or removes."""
         assert self.hydra_context is not None
         if setting not in self._values:
             [parsed] = OverridesParser.create().parse_overrides([setting])
@@ -310,7 +298,6 @@ class Sweeper(Base):
         return jobs
 
     def _launch(self, jobs: Mapping[Overrides, Sequence[Path]], errors: dict[Path, str]) -> None:
-        """Let the launcher run the jobs; collect errors by directory."""
         assert self.config is not None and self.launcher is not None
         folder = Path(self.config.hydra.sweep.dir)
         folder.mkdir(parents=True, exist_ok=True)

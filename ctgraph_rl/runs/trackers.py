@@ -210,5 +210,4 @@ def _need(package: str) -> None:
 
 
 def _name(folder: Path) -> str:
-    """A run's name by its directory, such as ``su_b1_4tasks/dqn-seed0-1a2b3c4d``."""
     return "/".join(folder.parent.parts[-2:])

@@ -158,7 +158,6 @@ def read_curriculum(path_or_dict: str | PathLike[str] | ReadOnlyValues, make: Ca
 
 
 def _plain(value: Any, places: Mapping[TaskLike, int]) -> Any:
-    """Return a value as JSON, with tasks by place if ``places`` is given."""
     if places and value in places:
         return places[value]
     if isinstance(value, tuple):
@@ -241,7 +240,6 @@ def _task(content: Any) -> TaskLike:
 
 
 def _kind(name: Any) -> type:
-    """Return the class of tasks that a file names: ours, or of an imported module."""
     require((isinstance(name, str), f"type must be the name of a kind of tasks, got {name!r:.80}"))
     if name in TASK_KINDS:
         return TASK_KINDS[name]

@@ -147,7 +147,6 @@ class Life(Sequence[Block]):
 
     @cached_property
     def _neighbours(self) -> dict[int, list[int]]:
-        """For each choice, those that differ from it in one decision only."""
         places = {task: place for place, task in enumerate(self.choices)}
         found: dict[int, list[int]] = {}
         for task, place in places.items():
@@ -162,7 +161,6 @@ class Life(Sequence[Block]):
 
     @cached_property
     def _opposites(self) -> dict[int, list[int]]:
-        """For each choice, those on its graph that differ from it at every decision."""
         found: dict[int, list[int]] = {}
         for place, task in enumerate(self.choices):
             found[place] = []
@@ -257,7 +255,6 @@ class _Draws:
             self._add(self._below(len(life.choices)), self._new_image(), place)
 
     def _new_image(self) -> int:
-        """Draw an image set other than the last."""
         known = self.life.image_seeds
         if not known:
             return self._below(IMAGE_SEEDS)

@@ -144,8 +144,6 @@ def _surplus(section: str, key: str, dialect: str) -> str:
 
 
 def _value_rules(found: NamedValues, places: dict[str, tuple[str, str]]) -> list[Rule]:
-    """Return the rules for values that a task's parts do not check."""
-
     def said(name: str) -> str:
         return f"{'.'.join(places[name])} must be"
 

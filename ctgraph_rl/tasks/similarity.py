@@ -268,7 +268,6 @@ def _equal_everywhere(one: _Choices, other: _Choices, kind: StateType, level: in
 
 @lru_cache(maxsize=64)
 def _nodes(own_b: int, b: int, level: int) -> list[int]:
-    """Numbers within a level of the nodes that b decisions reach."""
     if level == 0:
         return [0]
     nodes: list[int] = []
@@ -324,7 +323,6 @@ def _unique_ids(task: Task, kind: StateType, level: int) -> list[int]:
 
 
 def _contents(task: Task, ids: Sequence[int]) -> Iterator[bytes]:
-    """Return a digest of each image, equal for equal images of any set."""
     needed = bank_bytes([task])
     variants = task.images.num_variants
     rule = f"images of {needed:,} bytes are too many to compare, the limit is {MAX_COMPARED_BYTES:,}; use fewer"

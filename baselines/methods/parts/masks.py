@@ -53,7 +53,6 @@ class Masks(TaskMethod):
 
     @override
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        """The optimiser now trains the scores."""
         super().setup(agent, weights, curriculum)
         vectors = [name for name, each in weights.named if each.ndim < 2 and "bias" not in name.rpartition(".")[2]]
         rule = f"{type(self).__name__} masks weight matrices, and {', '.join(vectors)} are none"
@@ -186,14 +185,12 @@ def combined(betas: Tensor, old: Tensor, new: Tensor) -> Tensor:
 
 
 def _signed_constant(parameter: Tensor) -> Tensor:
-    """Return the sign of weights times sqrt(2 / inputs), and 0 for biases."""
     if parameter.ndim < 2:
         return torch.zeros_like(parameter)
     return parameter.sign() * (2 / parameter[0].numel()) ** 0.5
 
 
 def _drawn_scores(parameter: Tensor) -> Tensor:
-    """Draw uniformly from +-1 / sqrt(inputs); biases are 0."""
     if parameter.ndim < 2:
         return torch.zeros_like(parameter)
     most = parameter[0].numel() ** -0.5

@@ -273,7 +273,6 @@ class SelfLabelledAgent(nn.Module):
                 self._take_snapshot()
 
     def _suspect(self) -> int:
-        """Roll back, end the task and try the first label; return the frames whose learning was undone."""
         undone = sum(each["frames"] for each in self.snapshots)
         self.snapshots = self.snapshots[:1]
         self._restore()

@@ -76,7 +76,6 @@ def _mean(tasks: Sequence[Task], value: Callable[[Task], float]) -> float | None
 
 
 def _is_plain(task: Task) -> bool:
-    """Whether a task pays only at its goal."""
     return is_needle(task) and task.goal_reward > 0 and task.fail_reward == task.step_reward == 0
 
 

@@ -93,7 +93,6 @@ def _drawn(values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _better(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the share of pairs in which the first is better, float64 [samples]; equal pairs count half."""
     one = first[:, :, None]
     other = second[:, None, :]
     points = (one > other) + 0.5 * (one == other)

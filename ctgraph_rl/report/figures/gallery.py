@@ -83,7 +83,6 @@ class Gallery:
         return written
 
     def _stem(self, *names: str) -> str:
-        """A new name for a file, of letters that every system takes."""
         parts = [re.sub(r"[^A-Za-z0-9_.=]+", "-", name).strip("-.")[:LONGEST_STEM] for name in names]
         stem = "-".join(part for part in parts if part)
         same = sum(1 for taken in self._taken if taken == stem or re.fullmatch(rf"{re.escape(stem)}-\d+", taken))

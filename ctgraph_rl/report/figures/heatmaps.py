@@ -84,7 +84,6 @@ def draw_transfer(axes: Any, matrix: Estimates, labels: Sequence[str], trained: 
 
 
 def _values(matrix: Estimates) -> np.ndarray:
-    """Return values as float64 [rows, tasks], nan for none."""
     return np.array([[cell.value for cell in row] for row in matrix], dtype=np.float64, ndmin=2)
 
 

@@ -96,7 +96,6 @@ def _part(
 
 
 def _colour(task: int | None) -> tuple[float, float, float]:
-    """Return a task's colour, from a scale that also differs in grey and repeats."""
     from matplotlib import colormaps
 
     shades = 8

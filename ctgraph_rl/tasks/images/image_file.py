@@ -95,6 +95,5 @@ def _sha256(path: str) -> str:
 
 @lru_cache(maxsize=64)
 def _sha256_of_version(path: str, size: int, changed: int) -> str:
-    """SHA-256 of a file, read again when its size or time of change differs."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

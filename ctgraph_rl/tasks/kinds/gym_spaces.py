@@ -223,7 +223,6 @@ def _read_flag(value: Any, what: str) -> bool:
 
 
 def _only_item(value: Any) -> Any:
-    """Return the only item of an array or list; else the value unchanged."""
     value = plain(value)
     while isinstance(value, (list, tuple)) and len(value) == 1:
         value = value[0]
@@ -244,7 +243,6 @@ def _as_array(value: Any) -> NDArray[Any]:
 
 
 def _is_shown_rule(space: Any) -> tuple[bool, str]:
-    """Return the rule that a space has vectors or images, with the wrapper to add."""
     shown = is_box(space) and (len(space.shape) == 1 or (len(space.shape) in (2, 3, 4) and space.dtype == np.uint8))
     if getattr(space, "is_np_flattenable", False):
         fix = "add the wrapper gymnasium.wrappers:FlattenObservation, or one of your own"
