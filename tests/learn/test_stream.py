@@ -14,11 +14,14 @@ from helpers.scripted import Scripted
 from helpers.stopped_runs import logs_of_equal_ends, make_agent
 
 import curricula
+from baselines.methods.finetune import Finetune
 from baselines.methods.scratch import Scratch
 from ctgraph_rl import RunLog, learn_curriculum
 from ctgraph_rl.learn.refusals import notes
 from ctgraph_rl.learn.stacked import why_not_together
 from ctgraph_rl.log.scores import scores
+from ctgraph_rl.runs.config import composed
+from ctgraph_rl.runs.job import curriculum_of
 from ctgraph_rl.runs.read import read_run
 from ctgraph_rl.runs.train import new_agent, train
 from ctgraph_rl.tasks.gain import optimal_gain
@@ -130,6 +133,13 @@ def test_an_unfinished_life_and_noisy_episodes_have_no_windows():
     assert scores(cut, life)["window_return"].undefined == "the run is not finished: it ended block 3 of 5"
 
 
+@pytest.mark.parametrize(("settings", "seed"), [(["seed=7"], 7), (["seed=7", "curriculum.seed=9"], 9)])
+def test_a_runs_seed_draws_its_tasks_unless_the_curriculum_has_one(settings, seed):
+    life = curriculum_of(composed(["curriculum=stream", *settings]), Finetune())
+
+    assert life.tasks[:3] == curricula.load("stream", seed=seed).tasks[:3]
+
+
 def test_seeds_with_lives_of_their_own_are_not_trained_as_one_batch():
     assert why_not_together(stream()) is None
     assert "give curriculum.seed=0" in why_not_together(stream(seed=None))
@@ -178,7 +188,7 @@ def test_an_agent_keeps_copies_of_its_policy_for_few_tasks():
 
 
 def test_tables_of_a_life_have_windows_in_place_of_tasks(tmp_path):
-    life = stream({"every": 0}, num_tasks=12)
+    life = stream({"every": 0, "greedy": False}, num_tasks=12)
     agent = learner(life)
     train(life, agent, tmp_path, 0, config={"agent": {"_target_": "baselines.a2c.A2C"}, "seed": 0})
 
@@ -194,3 +204,4 @@ def test_tables_of_a_life_have_windows_in_place_of_tasks(tmp_path):
     assert run.windows("window_return")[1] == pytest.approx(fmean((at_end[3], at_end[4])))
     assert all(math.isnan(value) for value in run.windows("retention_100"))
     assert [curve[-1][0] for curve in run.history.training.values()][:3] == [2 * 64, 4 * 64, 5 * 64]
+    assert [len(curve) for curve in run.history.training.values()] == [2, 2, *[1] * 8]
