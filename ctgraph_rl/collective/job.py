@@ -38,7 +38,7 @@ from ctgraph_rl.runs.job import (
     train_experts,
 )
 from ctgraph_rl.runs.session import Failures, RunMember, Session, SessionCoupling, mark_failure
-from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.curriculum import Curriculum, Stream
 
 LONG_ID = 1000
 """Length of a one-hot task id above which a collective warns."""
@@ -80,6 +80,8 @@ def run_collective(cfg: Any, run_dir: Path) -> None:
 def _learn(session: Session, cfg: Any, cells: Sequence[ConfigAndPath], exchange: ExchangeLike, run_dir: Path) -> None:
     with Interrupt() as interrupt, mark_failure(run_dir):
         members = _members(cells, interrupt)
+        listed = "a collective's tables list tasks, which a stream draws one by one: take Stream.first(n)"
+        require((not any(isinstance(member.curriculum, Stream) for member in members), listed))
         _warn_of_long_ids([member.curriculum for member in members])
         exchange.connect([member.agent for member in members])
         checkpoints = checkpoints_of(cfg, run_dir, interrupt)

@@ -49,7 +49,7 @@ from ctgraph_rl.runs.settings import as_before, differences, flat
 from ctgraph_rl.runs.status import holds_results
 from ctgraph_rl.runs.trackers import FOLDER, Tracker
 from ctgraph_rl.runs.train import MakeAgent, MakePlasticity, new_agent, with_method
-from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.curriculum import Curriculum, Stream
 from ctgraph_rl.tasks.protocol import changed
 
 OF_AN_EXPERT = ("agent", "seed", "device", "num_threads", "portable")
@@ -80,6 +80,8 @@ def recipe_of(cfg: DictConfig) -> Recipe:
     make_method = method_of(cfg)
     make_alone = config.target(cfg, "agent")
     curriculum = curriculum_of(cfg, make_method())
+    no_experts = "experts=true trains one for each task, and a stream's metrics need none: take method=scratch"
+    require((not (cfg.experts and isinstance(curriculum, Stream)), no_experts))
     for task in curriculum.tasks if cfg.experts else ():  # refuses first what an agent cannot learn
         new_agent(expert_curriculum(curriculum, task), make_alone, cfg.seed)
     return Recipe(curriculum, with_method(make_alone, make_method, curriculum, plasticity_of(cfg)))

@@ -21,7 +21,7 @@ from ctgraph_rl.learn.refusals import notes
 from ctgraph_rl.learn.stacked import why_not_together
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.runs.config import composed
-from ctgraph_rl.runs.job import curriculum_of
+from ctgraph_rl.runs.job import build, curriculum_of
 from ctgraph_rl.runs.read import read_run
 from ctgraph_rl.runs.train import new_agent, train
 from ctgraph_rl.tasks.gain import optimal_gain
@@ -138,6 +138,11 @@ def test_a_runs_seed_draws_its_tasks_unless_the_curriculum_has_one(settings, see
     life = curriculum_of(composed(["curriculum=stream", *settings]), Finetune())
 
     assert life.tasks[:3] == curricula.load("stream", seed=seed).tasks[:3]
+
+
+def test_experts_of_a_stream_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="experts=true trains one for each task"):
+        build(composed(["curriculum=stream", "agent=ppo", "experts=true"]), tmp_path)
 
 
 def test_seeds_with_lives_of_their_own_are_not_trained_as_one_batch():
