@@ -37,6 +37,7 @@ STUDIES = {
     "memory": ("co_hard",),
     "adaptation": ("nm_uniform_goals",),
     "collectives": ("ct28", "ct28_mosaic_skips_d5", "l2d2c_16x16"),
+    "plasticity": ("goal_conflict", "stream"),
 }
 """Curricula by the page of the study that is about them."""
 
@@ -48,6 +49,7 @@ TITLES = {
     "memory": "memory cells",
     "adaptation": "adaptation",
     "collectives": "learners that share",
+    "plasticity": "plasticity",
 }
 
 

@@ -21,6 +21,7 @@ PAGES = {
     "lifelong": "studies.lifelong.page",
     "memory": "studies.memory.page",
     "no_labels": "studies.no_labels.page",
+    "plasticity": "studies.plasticity.page",
     "profile": "studies.profile",
     "streams": "studies.streams",
 }

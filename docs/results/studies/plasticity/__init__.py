@@ -1,4 +1,4 @@
 """Methods after a change of task, on tasks that each seed draws: the page plasticity.md.
 
-`page` makes its tables, and `matched` tells the start from the weights.
+`page` makes its table and numbers.
 """

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.stats import rankdata
 
 from ctgraph_rl.report import statistics
-from ctgraph_rl.report.statistics import Comparison
+from ctgraph_rl.report.statistics import LEAST_FOR_BOOTSTRAP, Comparison
 from studies.raw import HERE, TEMPLATES, Raw, groups, machines, mean_of, read, shown, table
 from studies.verdicts import UNKNOWN
 
@@ -37,9 +37,6 @@ NINE = {
     "upgd": "UPGD",
 }
 LABELS = {"none": "*fine-tuning*", "fresh_optimiser": "a fresh Adam", **NINE, "fresh": "*a fresh network*"}
-
-CONTROLS = ("none", "fresh_optimiser", "fresh")
-"""Conditions with which all others are compared."""
 
 METRICS = {
     "dormant_0.1": "dormant at 0.1",
@@ -83,29 +80,29 @@ def nine_against(curriculum: str, other: str) -> dict[str, Comparison]:
     return statistics.corrected({name: compared(curriculum, name, other) for name in ran})
 
 
-def conditions_table(curriculum: str) -> str:
-    """Return a row for each condition: area, share of blocks that reached 0.9, and differences paired by seed."""
+def conditions_table() -> str:
+    """Return a row for each condition: areas, blocks that reached 0.9, and differences paired by seed."""
     rows = []
-    tested = nine_against(curriculum, "none")
+    tested = nine_against(CONFLICT, "none")
     for condition, label in LABELS.items():
-        of_seeds = later_blocks(curriculum, condition)
-        if not of_seeds:
-            continue
-        blocks = [line for lines in of_seeds.values() for line in lines]
-        reached = sum(line["reached"] == "True" for line in blocks)
-        row = [label, mean_of([area(lines) for lines in of_seeds.values()], AREAS), f"{reached} of {len(blocks)}"]
-        for other in CONTROLS:
-            row.append("" if condition == other else shown(compared(curriculum, condition, other).difference))
+        of_seeds = later_blocks(CONFLICT, condition)
+        reached = sum(line["reached"] == "True" for lines in of_seeds.values() for line in lines)
+        row = [label, mean_of([area(lines) for lines in of_seeds.values()], AREAS), str(reached)]
         holm = tested[condition].holm if condition in tested else None
-        row.append("" if holm is None else f"{holm:.2g}")
-        rows.append(row)
-    head = ["condition", "area", "reached 0.9", *(f"less {LABELS[other].strip('*')}" for other in CONTROLS), "p"]
+        cells = [shown(compared(name, condition, "fresh").difference) for name in (CONFLICT, STREAM)]
+        if condition == "fresh":
+            cells = ["", ""]
+        rows.append([*row, cells[0], "" if holm is None else f"{holm:.2g}", cells[1]])
+    head = ["condition", "area", "reached 0.9", "less fresh", "p", f"`{STREAM}`: less fresh"]
     return table(head, rows)
 
 
 def better(curriculum: str, other: str = "none") -> str:
     """Return the methods that Holm's procedure finds better than another condition, and worse, in words."""
     parts = []
+    seeds = len(later_blocks(curriculum, other))
+    if len(NINE) * 2 ** (1 - seeds) > ALPHA:
+        return f"{UNKNOWN}, as no test of nine finds anything with {seeds} seeds"
     for word, sign in (("better", 1), ("worse", -1)):
         names = []
         for name, each in nine_against(curriculum, other).items():
@@ -115,29 +112,15 @@ def better(curriculum: str, other: str = "none") -> str:
     return "; ".join(parts)
 
 
-def matched_table() -> str:
-    """Return a row for each curriculum: what the start costs, and what the weights cost."""
-    rows = []
-    for (curriculum, blocks), lines in groups(read(MATCHED), "curriculum", "blocks_before").items():
-        of = _areas(lines)
-        means = [mean_of(of[network], AREAS) for network in ("fresh", "distilled", "old")]
-        costs = [shown(each.difference) for each in _costs(lines).values()]
-        misses = len({line["seed"] for line in lines}) - len(of["distilled"])
-        rows.append([f"`{curriculum}`, after {blocks}", *means, *costs, str(misses)])
-    head = ["before the last task", "fresh", "distilled", "old", "cost of the start", "cost of the weights", "misses"]
-    return table(head, rows)
-
-
 def matched_words() -> str:
-    """Return for each curriculum whether the start, or the weights, cost something."""
-    parts = []
-    for (curriculum, blocks), lines in groups(read(MATCHED), "curriculum", "blocks_before").items():
-        costs = []
-        for name, each in _costs(lines).items():
-            decided = each.p_value is not None and each.p_value <= ALPHA
-            costs.append(f"{name} {shown(each.difference)}{'' if decided else f' ({UNKNOWN})'}")
-        parts.append(f"before block {int(blocks) + 1} of `{curriculum}` {', '.join(costs)}")
-    return "; ".join(parts)
+    """Return what the start costs, and what the old weights cost, with the seeds that were not distilled."""
+    lines = read(MATCHED)
+    costs = []
+    for name, each in _costs(lines).items():
+        decided = each.p_value is not None and each.p_value <= ALPHA
+        costs.append(f"{name} {shown(each.difference)}{'' if decided else f' ({UNKNOWN})'}")
+    misses = len({line["seed"] for line in lines}) - len(_areas(lines)["distilled"])
+    return f"{', '.join(costs)}; seeds that were not distilled: {misses}"
 
 
 def _costs(lines: Raw) -> dict[str, Comparison]:
@@ -162,7 +145,8 @@ def _areas(lines: Raw) -> dict[str, list[float]]:
 def forecasts(curriculum: str) -> Mapping[str, tuple[float, float, float]]:
     """Return each metric's rank correlation with the area after the change, and its interval.
 
-    Ranks are within conditions; seeds are drawn with replacement. Intervals are corrected by Bonferroni.
+    Ranks are within conditions; seeds are drawn with replacement, and all of [-1, 1] is the interval of fewer than
+    `LEAST_FOR_BOOTSTRAP`. Intervals are corrected by Bonferroni.
     """
     by_condition = []
     for condition in LABELS:
@@ -182,7 +166,9 @@ def forecasts(curriculum: str) -> Mapping[str, tuple[float, float, float]]:
         scale = np.sqrt((weights @ values**2) * (weights @ areas**2))
         correlations = (weights @ (values * areas)) / np.where(scale > 0, scale, np.inf)
         tail = ALPHA / len(COLUMNS) / 2
-        low, high = np.quantile(correlations[1:], [tail, 1 - tail])
+        low, high = (
+            np.quantile(correlations[1:], [tail, 1 - tail]) if len(counts[0]) >= LEAST_FOR_BOOTSTRAP else (-1, 1)
+        )
         found[column] = (float(correlations[0]), float(low), float(high))
     return found
 
@@ -196,25 +182,15 @@ def _centred(by_condition: list[Raw], column: str) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def forecast_table() -> str:
-    """Return a row for each metric with its rank correlations."""
-    rows = []
-    found = [forecasts(curriculum) for curriculum in (CONFLICT, STREAM)]
-    for column in COLUMNS:
-        rows.append([_name(column), *(_cell(of[column]) for of in found)])
-    return table(["before the change", f"`{CONFLICT}`", f"`{STREAM}`"], rows)
-
-
-def _cell(found: tuple[float, float, float]) -> str:
-    value, low, high = found
-    return f"{value:.2f} [{low:.2f}, {high:.2f}]"
-
-
 def forecast_words(curriculum: str) -> str:
-    """Return the metrics whose interval leaves 0 out, the strongest first, or that none can be named."""
-    seen = {column: each for column, each in forecasts(curriculum).items() if each[1] > 0 or each[2] < 0}
-    order = sorted(seen, key=lambda column: -abs(seen[column][0]))
-    return "; ".join(f"{_name(column)}, {seen[column][0]:.2f}" for column in order[:3]) or UNKNOWN
+    """Return the strongest metric with its interval, and whether it can be said to forecast the area."""
+    found = forecasts(curriculum)
+    column = max(found, key=lambda name: abs(found[name][0]))
+    value, low, high = found[column]
+    decided = low > 0 or high < 0
+    if (low, high) == (-1, 1):
+        return f"{UNKNOWN} with few seeds"
+    return f"{_name(column)} {value:.2f} [{low:.2f}, {high:.2f}]{'' if decided else f', {UNKNOWN}'}"
 
 
 def _name(column: str) -> str:
@@ -225,16 +201,16 @@ def _name(column: str) -> str:
     return f"{METRICS[name]}, {images} images"
 
 
-def trials_table() -> str:
-    """Return a row for each condition: what was tried, what was chosen, and its area on the tuning seeds."""
-    rows = []
+def chosen() -> str:
+    """Return the settings that were chosen, and of how many."""
+    parts = []
     for (condition,), lines in groups(read(TRIALS), "condition").items():
         tried = groups([line for line in lines if int(line["block"]) > 1], "settings")
         scores = {settings: area(of) for (settings,), of in tried.items()}
         best = max(scores, key=lambda settings: scores[settings])
-        seeds = len({line["seed"] for line in lines})
-        rows.append([LABELS[condition], str(len(scores)), str(seeds), f"`{best}`", f"{scores[best]:.2f}"])
-    return table(["condition", "trials", "seeds", "chosen", "area"], rows)
+        if len(scores) > 1:
+            parts.append(f"{LABELS[condition].strip('*')} `{best}` of {len(scores)}")
+    return "; ".join(parts)
 
 
 def seconds() -> float:
@@ -251,20 +227,17 @@ def page() -> str:
         better_stream=better(STREAM),
         than_adam=better(CONFLICT, "fresh_optimiser"),
         adam=shown(compared(CONFLICT, "fresh_optimiser", "none").difference),
-        conflict=conditions_table(CONFLICT),
-        stream=conditions_table(STREAM),
+        conditions=conditions_table(),
         conflict_seeds=str(len(later_blocks(CONFLICT, "none"))),
         stream_seeds=str(len(later_blocks(STREAM, "none"))),
         loss_conflict=shown(compared(CONFLICT, "none", "fresh").difference),
         loss_stream=shown(compared(STREAM, "none", "fresh").difference),
-        matched=matched_table(),
-        matched_words=matched_words(),
-        forecast=forecast_table(),
+        matched=matched_words(),
         forecast_conflict=forecast_words(CONFLICT),
         forecast_stream=forecast_words(STREAM),
-        trials=trials_table(),
+        chosen=chosen(),
         minutes=f"{seconds():.0f}",
-        machines=machines(NAME, MATCHED, TRIALS),
+        machines=machines(NAME),
     )
 
 

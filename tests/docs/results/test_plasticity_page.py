@@ -1,0 +1,93 @@
+"""docs/results/plasticity.md: made from the raw results beside it, and what is computed from them, on made-up ones."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+from studies import raw
+from studies.plasticity import page
+
+
+def lines_of(condition: str, areas: list[float], rank: list[float] | None = None) -> list[dict[str, object]]:
+    """A line for the second block of each seed; all metrics are 0 but the effective rank on fresh images."""
+    lines = []
+    for seed, area in enumerate(areas):
+        for block in (1, 2):
+            line = {"curriculum": page.CONFLICT, "condition": condition, "seed": seed, "block": block, "area": area}
+            line |= {"reached": area >= 0.5, **dict.fromkeys(page.COLUMNS, 0)}
+            lines.append(line | {"rank_effective_fresh": 0 if rank is None else rank[seed]})
+    return lines
+
+
+@pytest.fixture
+def results(tmp_path, monkeypatch):
+    """Replaces the raw results of runs."""
+    monkeypatch.setattr(raw, "HERE", tmp_path)
+    return lambda *parts: raw.write(page.NAME, [line for part in parts for line in part])
+
+
+def test_the_page_is_made_from_the_raw_results():
+    assert page.page() == page.PAGE.read_text(encoding="utf-8")
+
+
+def test_a_method_is_better_only_after_the_correction_for_nine(results):
+    """Of ten pairs all of one sign have p = 1/512, and nine of them 11/512: times nine it is above 0.05."""
+    nine = {name: lines_of(name, [0.5] * 10) for name in page.NINE}
+    plain = lines_of("none", [0.5] * 10)
+    results(plain, *{**nine, "redo": lines_of("redo", [0.6] * 10), "fire": lines_of("fire", [0.4] * 10)}.values())
+    assert page.better(page.CONFLICT) == "better: ReDo; worse: FIRE"
+
+    results(plain, *{**nine, "redo": lines_of("redo", [0.6] * 9 + [0.4])}.values())
+    assert page.better(page.CONFLICT) == "better: none; worse: none"
+
+    results(plain, lines_of("redo", [0.6] * 9 + [0.4]))
+    assert page.better(page.CONFLICT) == "better: ReDo; worse: none"
+
+
+def test_eight_seeds_are_too_few_for_nine_tests(results):
+    results(lines_of("none", [0.5] * 8), lines_of("redo", [0.6] * 8))
+
+    assert page.better(page.CONFLICT) == "cannot be said, as no test of nine finds anything with 8 seeds"
+
+
+def test_differences_are_paired_by_seed_and_first_blocks_do_not_count(results):
+    own = [0.1, 0.5, 0.9]
+    better = lines_of("redo", [area + 0.1 for area in own])
+    better[0] |= {"area": 0.0}
+    results(lines_of("none", own), better)
+
+    found = page.compared(page.CONFLICT, "redo", "none")
+
+    assert (found.difference.value, found.wins) == (pytest.approx(0.1), 3)
+
+
+def test_a_metric_forecasts_within_conditions_and_not_across_them(results):
+    """Conditions that differ in both say nothing; within them the rank falls as the area grows."""
+    draw = random.Random(0)
+    areas = [draw.random() / 2 for _ in range(30)]
+    results(
+        lines_of("none", areas, [1 - area for area in areas]),
+        lines_of("redo", [area + 0.5 for area in areas], [9 - area for area in areas]),
+    )
+    assert page.forecasts(page.CONFLICT)["rank_effective_fresh"][0] == pytest.approx(-1)
+    assert page.forecast_words(page.CONFLICT) == "effective rank, fresh images -1.00 [-1.00, -1.00]"
+
+    few = [lines_of(name, areas[:9], [1 - area for area in areas[:9]]) for name in ("none", "redo")]
+    results(*few)
+    assert page.forecast_words(page.CONFLICT) == "cannot be said with few seeds"
+
+    results(lines_of("none", [0.2] * 30, [1] * 30), lines_of("redo", [0.8] * 30, [2] * 30))
+    assert page.forecast_words(page.CONFLICT).endswith(" 0.00 [0.00, 0.00], cannot be said")
+
+
+def test_a_cost_is_of_seeds_that_were_distilled_and_the_others_are_counted(results):
+    lines = []
+    for seed in range(6):
+        for network, area in (("fresh", 0.8), ("distilled", 0.7), ("old", 0.4)):
+            line = {"curriculum": page.CONFLICT, "network": network, "seed": seed, "blocks_before": 1}
+            lines.append(line | {"area": 0.0 if seed == 5 else area, "met": seed < 5 or network != "distilled"})
+    raw.write(page.MATCHED, lines)
+
+    costs = "the start 0.10 (cannot be said), the old weights 0.30 (cannot be said)"
+    assert page.matched_words() == f"{costs}; seeds that were not distilled: 1"
