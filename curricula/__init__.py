@@ -84,6 +84,9 @@ def _function(name: str) -> Callable[..., Curriculum]:
     if name not in _named():
         near = nearest(str(name), names())
         hint = "ctgraph-rl curricula lists all" if near is None else f"did you mean {near!r}?"
+        one_task = f"CT-{str(name).upper().replace('_', '-').removeprefix('CT-')}"
+        if one_task in import_module("ctgraph_rl.tasks.configurations").CONFIGURATIONS:
+            hint = f"{one_task} is a configuration of one task, which ctgraph-rl draw {one_task} shows"
         if f"from_{name}" in _HOMES:
             hint = f"it is made from settings: curricula.from_{name}(...)"
         raise ValueError(f"unknown curriculum {name!r}; {hint}")

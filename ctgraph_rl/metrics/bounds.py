@@ -48,6 +48,16 @@ def of_regret(known: Known) -> LowAndHigh:
     return 0.0 if known.highest_share <= 1 else -math.inf, math.inf
 
 
+def of_losses(known: Known) -> LowAndHigh:
+    """Return the bounds of a mean over tasks of optimum less return."""
+    return 0.0 if known.highest_share <= 1 else -math.inf, known.high - known.low
+
+
+def of_kept_shares(known: Known) -> LowAndHigh:
+    """Return the bounds of what is left of a gain over failure."""
+    return 0.0 if known.lowest_share >= 0 else -math.inf, math.inf
+
+
 def of_search_regret(known: Known) -> LowAndHigh:
     """Return the bounds of goals missed against the best search."""
     return known.lowest_search_regret, known.highest_search_regret

@@ -13,7 +13,15 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from ctgraph_rl.metrics.bounds import between, not_negative, of_changes, of_performance
+from ctgraph_rl.metrics.bounds import (
+    between,
+    from_failure_to_best,
+    not_negative,
+    of_changes,
+    of_kept_shares,
+    of_losses,
+    of_performance,
+)
 from ctgraph_rl.metrics.record import HERE, MASTERED, METRICS, Undefined, defined, ratio
 
 NUM_WINDOWS = 10
@@ -22,6 +30,7 @@ NUM_WINDOWS = 10
 JUMP_START = "Taylor & Stone 2009, JMLR 10: jumpstart"
 
 of_windows = partial(defined, source=HERE, partial=True, missing="no task of a window has a value")
+of_retention = partial(of_windows, aggregate=torch.sum, bounds=of_kept_shares)
 
 
 @dataclass(frozen=True)
@@ -103,7 +112,12 @@ def window_success(life: LifeCurves) -> Tensor:
     return window_means(life.success)
 
 
-@of_windows("ctgraph_rl/window-regret", "mean over the last w tasks i of V*_i - R_i(end of i's block)", aggregate=_last)
+@of_windows(
+    "ctgraph_rl/window-regret",
+    "mean over the last w tasks i of V*_i - R_i(end of i's block)",
+    aggregate=_last,
+    bounds=of_losses,
+)
 def window_regret(life: LifeCurves) -> Tensor:
     """Mean distance to the optimum at the end of their blocks of the last window's tasks."""
     return window_means(life.best - life.returns[:, -1])
@@ -158,6 +172,7 @@ def never_adapted(life: LifeCurves) -> Tensor:
 @of_windows(
     "ctgraph_rl/adaptation-area",
     "mean over windows, tasks i and evaluations t > 0 of i's block of (R_i(t) - zero_i) / (V*_i - zero_i)",
+    bounds=from_failure_to_best(0, 1),
 )
 def adaptation_area(life: LifeCurves) -> Tensor:
     """Area under a task's curve over its block, on a scale from failure to optimum."""
@@ -176,19 +191,19 @@ def _retention(life: LifeCurves, lag: int) -> Tensor:
     return ratio(sums, own.nansum())
 
 
-@of_windows("ctgraph_rl/retention-1", "sum_i R_i(1 block later) / sum_i R_i(end of i's block)", aggregate=torch.sum)
+@of_retention("ctgraph_rl/retention-1", "sum_i R_i(1 block later) / sum_i R_i(end of i's block)")
 def retention_1(life: LifeCurves) -> Tensor:
     """Share of a task's return, from failure to optimum, that is left one block later."""
     return _retention(life, 1)
 
 
-@of_windows("ctgraph_rl/retention-10", "as retention-1, 10 blocks later", aggregate=torch.sum)
+@of_retention("ctgraph_rl/retention-10", "as retention-1, 10 blocks later")
 def retention_10(life: LifeCurves) -> Tensor:
     """Share that is left ten blocks later."""
     return _retention(life, 10)
 
 
-@of_windows("ctgraph_rl/retention-100", "as retention-1, 100 blocks later", aggregate=torch.sum)
+@of_retention("ctgraph_rl/retention-100", "as retention-1, 100 blocks later")
 def retention_100(life: LifeCurves) -> Tensor:
     """Share that is left a hundred blocks later."""
     return _retention(life, 100)

@@ -26,15 +26,15 @@ WIDTH = 80
 """Characters of a line on a terminal."""
 
 MEANS = "mean [95 % CI]"
-CI = "CI: confidence interval, which holds the true value in 95 of 100 such experiments"
-_EXACT = f"solved seeds and median times [exact 95 % CI]; {CI}"
-LEGEND = f"{MEANS}, {_EXACT}"
+CI = "95 of 100 such intervals (CI) hold the true value"
+_EXACT = f"those of solved seeds and median times are exact; {CI}"
+LEGEND = f"{MEANS}; {_EXACT}"
 
 LEGENDS = {
     "exact": LEGEND,
-    "t": f"mean [Student's 95 % CI], {_EXACT}",
-    "std": f"mean ± standard deviation over seeds, {_EXACT}",
-    "iqm": f"interquartile mean [bootstrap 95 % CI], {_EXACT}",
+    "t": f"mean [Student's 95 % CI]; {_EXACT}",
+    "std": f"mean ± standard deviation over seeds; solved seeds and median times have exact intervals; {CI}",
+    "iqm": f"interquartile mean [bootstrap 95 % CI]; {_EXACT}",
     "seeds": "single runs",
 }
 """What the numbers of a table are, by `ctgraph_rl.parsers.STATISTICS`, and of a table of single runs."""
