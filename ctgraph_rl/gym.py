@@ -379,13 +379,13 @@ class StreamVectorEnv(CTGraphVectorEnv):
     """A stream for any trainer: all rows have the task of the present block, from their next episode on.
 
     ``info`` also has ``task``, the number of the block in which the task came first, from 0; ``optimum``, its exact
-    best mean return; and, where an episode ends, as ``_regret`` says, ``regret``: the optimum less its return. The last
-    task stays once the stream is over.
+    best mean return; and, where an episode ends, as ``_regret`` says, ``regret``: the optimum less its return. Its last
+    task stays once the stream is over, with a warning; a reset of all rows with a seed starts the stream again.
 
     Args:
         num_envs: rows; a frame is one row for one step.
         stream: a `Stream`; None: ``curriculum=stream`` with ``settings``.
-        seed: draws the tasks of a stream without a seed. `reset` starts the rows' random streams.
+        seed: draws the tasks of a stream without a seed.
         render_mode: as in `CTGraphVectorEnv`, also ``autoreset_mode``, ``kernel`` and ``life``.
         settings: such as ``num_tasks=1000``.
 
@@ -439,7 +439,20 @@ class StreamVectorEnv(CTGraphVectorEnv):
             self._start_block()
         return taken
 
+    @override
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: NamedValues | None = None
+    ) -> tuple[Any, NamedValues]:
+        if seed is not None and "reset_mask" not in (options or {}):
+            self._frames = 0
+            self.set_tasks([self.stream.tasks[0]] * self.num_envs)
+        return super().reset(seed=seed, options=options)
+
     def _start_block(self) -> None:
+        if self._frames == self.stream.num_frames:
+            logger.warn(
+                f"the stream of {self._frames:,} frames is over, its last task stays: reset(seed=) starts it again"
+            )
         if self.stream.is_end(self._frames) and self._frames < self.stream.num_frames:
             self.set_tasks([self.stream.tasks[self.stream.block_at(self._frames)]] * self.num_envs)
 

@@ -63,7 +63,8 @@ def optimal_performance(best: Tensor) -> Tensor:
 def memory_gap_closed(performance: Tensor, memoryless_ceilings: Tensor, best: Tensor) -> Tensor:
     """Share of the gap between the best memoryless policy and the optimum that is closed after the last block.
 
-    1 is optimal, 0 is the best policy without memory, and less is negative: forgetting counts, too. Tasks that need no memory are left out.
+    1 is optimal, 0 is the best policy without memory, and less is negative: forgetting counts, too. Tasks that need no
+    memory are left out.
 
     Args:
         performance: float64 [blocks + 1, tasks], mean undiscounted returns.

@@ -18,7 +18,8 @@ ID = "ctgraph/Stream-v0"
 def test_rows_change_to_the_next_task_when_their_episodes_end_after_a_block(mode):
     envs = gymnasium.make_vec(ID, num_envs=4, num_tasks=3, num_frames=64, seed=5, autoreset_mode=mode).unwrapped
     stream = curricula.load("stream", num_tasks=3, num_frames=64, seed=5)
-    observations, infos = envs.reset(seed=0)
+    first, infos = envs.reset(seed=0)
+    observations = first
     assert infos["optimum"].tolist() == [1.0] * 4
 
     for step in range(1, 80):
@@ -30,7 +31,21 @@ def test_rows_change_to_the_next_task_when_their_episodes_end_after_a_block(mode
         observations, _, _, _, infos = envs.step(np.random.default_rng(step).integers(0, 3, 4))
 
     assert infos["task"].tolist() == [2] * 4  # the last task stays
+    again, infos = envs.reset()
+    assert infos["task"].tolist() == [2] * 4
+    again, infos = envs.reset(seed=0)
+    assert (infos["task"].tolist(), again.tolist()) == ([0] * 4, first.tolist())
     assert stream.tasks[0] == envs.stream.tasks[0]
+
+
+def test_the_end_of_a_stream_is_told():
+    envs = gymnasium.make_vec(ID, num_envs=4, num_tasks=2, num_frames=64, seed=5)
+    envs.reset(seed=0)
+    for _ in range(31):
+        envs.step(np.zeros(4, np.int64))
+
+    with pytest.warns(UserWarning, match="the stream of 128 frames is over, its last task stays"):
+        envs.step(np.zeros(4, np.int64))
 
 
 def test_regret_is_told_where_an_episode_ends():
