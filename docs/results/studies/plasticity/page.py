@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from statistics import fmean
 from string import Template
@@ -11,7 +12,7 @@ from scipy.stats import rankdata
 
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.statistics import LEAST_FOR_BOOTSTRAP, Comparison
-from studies.raw import HERE, TEMPLATES, Raw, groups, machines, mean_of, read, shown, table
+from studies.raw import HERE, TEMPLATES, Raw, groups, mean_of, read, shown, table
 from studies.verdicts import UNKNOWN
 
 NAME = "plasticity"
@@ -202,14 +203,15 @@ def _name(column: str) -> str:
 
 
 def chosen() -> str:
-    """Return the settings that were chosen, and of how many."""
+    """Return the settings that were chosen of several."""
     parts = []
     for (condition,), lines in groups(read(TRIALS), "condition").items():
         tried = groups([line for line in lines if int(line["block"]) > 1], "settings")
         scores = {settings: area(of) for (settings,), of in tried.items()}
         best = max(scores, key=lambda settings: scores[settings])
         if len(scores) > 1:
-            parts.append(f"{LABELS[condition].strip('*')} `{best}` of {len(scores)}")
+            values = ",".join(f"{name}={value}" for name, value in json.loads(best).items())
+            parts.append(f"`{condition}` {values}")
     return "; ".join(parts)
 
 
@@ -237,7 +239,6 @@ def page() -> str:
         forecast_stream=forecast_words(STREAM),
         chosen=chosen(),
         minutes=f"{seconds():.0f}",
-        machines=machines(NAME),
     )
 
 
