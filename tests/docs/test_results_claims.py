@@ -92,7 +92,7 @@ def test_instances_cost_nothing_greedily_and_serve_dqn_as_dice(make):
     assert (len(gains), round(min(gains), 2), round(max(gains), 2)) == (6, 0.07, 0.2)
     runs = [float(line["greedy_return"]) for key in two if key[2] == "dqn" for line in cells[key]]
     assert (sum(value > 0.13 for value in runs), sum(value == 0 for value in runs)) == (17, 13)
-    assert "17 of these 30 runs have more than 0, and the others 0" in RESULTS
+    assert "Of these 30 runs 17 have more than 0, and the others 0" in RESULTS
     assert "no cell has a lower mean than with constant images. Sampled, the largest loss is 0.06" in RESULTS
     assert "DQN even gains 0.07 to 0.20 on the goals that take two different decisions" in RESULTS
 

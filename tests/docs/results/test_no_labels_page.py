@@ -137,7 +137,7 @@ def test_found_changes_and_other_alarms_are_counted_from_the_spans(made, masks):
         f"SWOKS: with fresh trials {fresh[0]} of its {fresh[1]} other alarms are false, and {fresh[2]} came while"
         in PAGE
     )
-    assert f"with published ones {published[0]} and {published[2]} of {published[1]}." in PAGE
+    assert f"With published ones they are {published[0]} and {published[2]} of {published[1]}." in PAGE
     second = next(span for span in spans[tuple(swoks[1][key] for key in RUN)] if int(span["end"]) > 442_368)
     assert (second["start"], second["label"], second["learned"]) == ("442368", "1", "True")
     assert f"label 1 was accepted {442_368 - 384_000:,} frames after the first change" in PAGE
