@@ -79,7 +79,18 @@ def claims() -> str:
                 if same:
                     gains.append(fmean(solved(line)) - fmean(solved(same[0])))
             rows.append(_claim(f"{name} solves more tasks with {METHODS[method]} than fine-tuned", gains))
-    return table(["sentence", "difference", "seeds", "verdict"], rows)
+    return table(["sentence", "difference", "seeds", "verdict"], [row for row in rows if row[2] != "0"])
+
+
+def counts() -> dict[str, str]:
+    """Return the tasks that were solved, means over seeds, by ``AGENT_METHOD``; of the first and last ten behind it."""
+    found = {}
+    for (agent, method), lines in runs().items():
+        name = f"{agent}_{method}"
+        found[name] = f"{100 * fmean(fmean(solved(line)) for line in lines):.0f}"
+        found[f"{name}_first"] = f"{10 * fmean(solved(line)[0] for line in lines):.0f}"
+        found[f"{name}_last"] = f"{10 * fmean(solved(line)[-1] for line in lines):.0f}"
+    return found
 
 
 def _claim(sentence: str, values: list[float]) -> list[str]:
@@ -101,7 +112,7 @@ def draw(path: Path) -> None:
                 means = [fmean(values) for values in zip(*lines, strict=True)]
                 axes.plot(range(1, NUM_WINDOWS + 1), means, color=f"C{position}", linewidth=1, label=words)
         axes.set_title(name, fontsize=9)
-        axes.set(xlabel="window of 10 tasks", ylim=(-0.05, 1.05))
+        axes.set(xlabel="window of 10 tasks", xticks=(1, 4, 7, 10), ylim=(-0.05, 1.05))
     panels[0].set_ylabel("share of tasks solved")
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", ncols=4, fontsize=7)
@@ -114,6 +125,7 @@ def page() -> str:
     rates = {AGENTS[line["agent"]]: line["learning_rate"] for line in lines}
     text = (TEMPLATES / "streams.md").read_text(encoding="utf-8")
     return Template(text).substitute(
+        counts(),
         table=table_of_runs(),
         claims=claims(),
         rates=", ".join(f"{name} {rate}" for name, rate in rates.items()),

@@ -1,0 +1,40 @@
+"""docs/results/streams.md: made from the raw results beside it."""
+
+from __future__ import annotations
+
+import pytest
+
+import curricula
+
+
+@pytest.fixture(scope="module")
+def streams():
+    from studies import streams
+
+    return streams
+
+
+def test_the_page_is_what_its_raw_results_make(streams):
+    assert streams.page() == streams.PAGE.read_text(encoding="utf-8")
+
+
+def test_the_runs_are_of_the_named_stream_with_shorter_blocks_and_share_their_lives(streams):
+    lines = streams.read(streams.NAME)
+    life = curricula.load("stream", num_frames=12_288)
+
+    assert {line["fingerprint"] for line in lines} <= {life.fingerprint, _with_ids(life).fingerprint}
+    assert {line["num_tasks"] for line in lines} == {"100"}
+
+
+def _with_ids(life):
+    from dataclasses import replace
+
+    return replace(life, protocol=replace(life.protocol, task_id="at_boundaries"))
+
+
+def test_regret_and_solved_tasks_are_those_of_one_life(streams):
+    for line in streams.read(streams.NAME):
+        solved = streams.solved(line)
+        assert float(line["window_solved"]) == pytest.approx(solved[-1], abs=1e-3)
+        assert 0 <= sum(solved) <= (1 - float(line["never_adapted"])) * 10 + 1e-3
+        assert 0 <= float(line["frame_regret"]) / streams.frames(line) <= 1 / 6 + 1e-3
