@@ -38,6 +38,7 @@ STUDIES = {
     "adaptation": ("nm_uniform_goals",),
     "collectives": ("ct28", "ct28_mosaic_skips_d5", "l2d2c_16x16"),
     "plasticity": ("goal_conflict", "stream"),
+    "streams": ("stream",),
 }
 """Curricula by the page of the study that is about them."""
 
@@ -50,6 +51,7 @@ TITLES = {
     "adaptation": "adaptation",
     "collectives": "learners that share",
     "plasticity": "plasticity",
+    "streams": "a life of a hundred tasks",
 }
 
 
