@@ -7,7 +7,7 @@ zero on a task's few images may serve others.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -113,7 +113,7 @@ def weights_of(agent: Agent) -> list[Tensor]:
     return [parameter.detach().clone() for parameter in agent.policy.parameters()]
 
 
-def _norm(tensors: list[Tensor]) -> float:
+def _norm(tensors: Sequence[Tensor]) -> float:
     return torch.stack(torch._foreach_norm(tensors)).norm().item()
 
 
@@ -175,7 +175,7 @@ class UnitMeter:
             frames: of the run so far.
             moment: ``start``, ``during`` or ``end`` of the block, or ``batch``.
         """
-        tasks = [*dict.fromkeys(self.curriculum.blocks[block - 1].tasks)]
+        tasks = [task for task in dict.fromkeys(self.curriculum.blocks[block - 1].tasks) if isinstance(task, Task)]
         own = torch.cat([task_images(task, self._shape) for task in tasks]).unique(dim=0)
         for name, images in (("task", own), ("fresh", fresh_images(tasks[0]))):
             if images is not None:

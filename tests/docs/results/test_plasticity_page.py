@@ -48,7 +48,7 @@ def test_a_method_is_better_only_after_the_correction_for_nine(results):
 def test_eight_seeds_are_too_few_for_nine_tests(results):
     results(lines_of("none", [0.5] * 8), lines_of("redo", [0.6] * 8))
 
-    assert page.better(page.CONFLICT) == "cannot be said, as no test of nine finds anything with 8 seeds"
+    assert page.better(page.CONFLICT) == "cannot be said: 8 seeds"
 
 
 def test_differences_are_paired_by_seed_and_first_blocks_do_not_count(results):
