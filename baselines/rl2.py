@@ -95,8 +95,8 @@ class RL2(PPO):
 
     def __init__(self, observation_spec: Composite, action_spec: TensorSpec, **settings: Any) -> None:
         found = "outcome" in observation_spec.keys()  # noqa: SIM118, a Composite is no dict
-        fix = "take agent=lstm_ppo or protocol.episodes=shown"
-        require((found, f"RL2 needs CT-graphs, whose episodes say whether they found the goal: {fix}"))
+        needs = "RL2 needs CT-graphs that show the ends of episodes, which protocol.episodes=hidden hides"
+        require((found, f"{needs}: set protocol.episodes=shown, or take agent=lstm_ppo"))
         super().__init__(observation_spec, action_spec, **settings)
         self.trial_episodes = self.settings.trial_episodes
 

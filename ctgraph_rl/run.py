@@ -58,21 +58,25 @@ def run(cfg: DictConfig, run_dir: Path) -> float | None:
     return run_configuration(cfg, run_dir)
 
 
-def show_sweep(run_dirs: Sequence[Path]) -> None:
-    """Print a finished sweep's table, if short and with scipy, and the command for more."""
+def show_sweep(run_dirs: Sequence[Path], tuning: bool = False) -> None:
+    """Print a finished sweep's table, if short and with scipy, and the command for more.
+
+    ``tuning`` tells whether some are tuning runs.
+    """
     here = Path(os.path.relpath(os.path.commonpath(run_dirs)))
     folder = terminal_text(shlex.quote(str(here)))
+    shows = "--tuning " * tuning + folder
     if not (run_dirs[0] / LOG).exists():
         print(makes_page(f"collectives {folder}"))
     elif find_spec("scipy") is None:
-        print(f"ctgraph-rl results --per-seed {folder} prints the runs; for means, pip install 'ctgraph_rl[stats]'")
+        print(f"ctgraph-rl results --per-seed {shows} prints the runs; for means, pip install 'ctgraph_rl[stats]'")
     elif len(run_dirs) > MOST_IN_TABLE:
-        print(f"ctgraph-rl results {folder} prints a table")
+        print(f"ctgraph-rl results {shows} prints a table")
     else:
         from ctgraph_rl.report.results import print_table  # here: --help and a wrong setting need no torch
 
         print_table(run_dirs)
-        print(f"\n{makes_page(f'report {folder}')}")
+        print(f"\n{makes_page(f'report {shows}')}")
 
 
 class CellError(RuntimeError):
@@ -182,7 +186,7 @@ def main() -> None:
                 Sweeper.done = ()
                 of_hydra(hydra.main)(config_path=conf_dir(), config_name="config")(HydraJob())()
                 if Sweeper.done:
-                    show_sweep(Sweeper.done)
+                    show_sweep(Sweeper.done, Sweeper.tuning)
         except Restart:
             restart(environment, arguments)
     except (Stop, *ERRORS) as error:

@@ -10,7 +10,8 @@ from hydra.core.hydra_config import HydraConfig
 
 from ctgraph_rl.collective.job import run_collective
 from ctgraph_rl.log.escape import terminal_text
-from ctgraph_rl.log.files import list_members
+from ctgraph_rl.log.files import LOG, list_members
+from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.packages import makes_page
 from ctgraph_rl.report.objective import check_objective, objective_of
 from ctgraph_rl.report.style import require_packages
@@ -34,24 +35,25 @@ def run_configuration(cfg: Any, run_dir: Path) -> float | None:
         run_dirs = [run_dir]
     if "exchange" not in cfg and (cfg.report or not in_sweep()):
         for each in run_dirs:
-            show(each, cfg.report)
+            show(each, cfg.report, cfg.objective_until is not None)
     searches = not in_sweep() or HydraConfig.get().runtime.choices["hydra/sweeper"] != "cells"
     if cfg.objective is None or not searches:
         return None
     value = objective_of(cfg.objective, run_dirs)
     if cfg.objective_until is not None and not in_sweep():
-        print(f"{cfg.objective} after {cfg.objective_until:g} of the frames: {value:.4f}")
+        ended = int(RunLog.read(run_dirs[0] / LOG).training("frames")[-1])
+        print(f"{cfg.objective} after {ended:,} frames (objective_until={cfg.objective_until:g}): {value:.4f}")
     return value
 
 
-def show(run_dir: Path, report: bool) -> None:
-    """Print a finished run's results, and make its report or say how."""
+def show(run_dir: Path, report: bool, tuning: bool = False) -> None:
+    """Print a finished run's results, and make its report or say how; ``tuning`` tells whether it is a tuning run."""
     print_summary(run_dir)
     here = Path.cwd()
     shown = run_dir.relative_to(here) if run_dir.is_relative_to(here) else run_dir
     print(f"results: {terminal_text(shown)}")
     if not report:
-        print(makes_page(f"report {shlex.quote(str(shown))}"))
+        print(makes_page(f"report {'--tuning ' * tuning}{shlex.quote(str(shown))}"))
         return
     from ctgraph_rl.report.page import write_report  # here: most runs make no page
 

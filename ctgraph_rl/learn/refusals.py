@@ -77,6 +77,22 @@ def check_episodes(curriculum: Curriculum, agent: Agent) -> None:
     require((not hides or not getattr(learner, "needs_episodes", False), needs))
 
 
+def check_share(curriculum: Curriculum, agent: Agent, until: float | None) -> None:
+    """Refuse a tuning run of fewer than two batches, after which trials hardly differ.
+
+    Raises:
+        ValueError: names the frames of both.
+    """
+    if until is None:
+        return
+    frames = curriculum.frames_of(until)
+    batch = agent.num_envs * agent.num_steps
+    share = f"objective_until={until} is {frames:,} of num_frames={curriculum.num_frames:,}"
+    shape = f"num_envs={agent.num_envs} x num_steps={agent.num_steps} = {batch:,} frames"
+    fix = "set a larger share or more frames, or a smaller num_envs or num_steps"
+    require((frames >= 2 * batch, f"{share}, less than two batches of {shape}: {fix}"))
+
+
 def check_exact(curriculum: Curriculum, agent: Agent) -> None:
     """Refuse exact evaluation of an agent, or on a task, that has no exact measures.
 

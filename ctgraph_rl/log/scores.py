@@ -80,7 +80,9 @@ def inputs_of(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | N
     facts = _facts(curriculum)
     share = next(map(tuning_share, log.of_kind("run")), None)
     if share is not None and share < 1:
-        reason = Undefined(f"a tuning run ends after {share:g} of the frames, and has only metrics of training")
+        reached = max((m["frames"] for m in log.of_kind("training")), default=0)
+        ended = f"a tuning run, which ended after {reached:,} of {curriculum.num_frames:,} frames"
+        reason = Undefined(f"{ended}, has only metrics of training")
         found = _training(log, curriculum, facts["best"], curriculum.frames_of(share))
         known = {name: found[name] for name in OF_A_PART if name in found}
         return {name: facts.get(name, known.get(name, reason)) for name in INPUTS}

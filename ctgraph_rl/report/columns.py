@@ -60,13 +60,19 @@ def board_columns(curriculum: Curriculum) -> list[str]:
 
 
 def columns_of_runs(runs: Sequence[Run]) -> dict[str, tuple[str, ...]]:
-    """Return `columns` of each curriculum, by its name in tables; with tuning runs, `online_return` is the first."""
+    """Return `columns` of each curriculum, by its name in tables."""
     found = {}
     for name, some in by_curriculum(runs).items():
         known = histories(some)
         trained = max((history.trained for history in known), key=len, default=())
         is_life = any("life" in run.about for run in some)
         found[name] = columns(trained, any(history.adaptation for history in known), is_life)
-        if any(tuning_share(run.about) is not None for run in some):
-            found[name] = "online_return", *found[name]
     return found
+
+
+def objective(run: Run) -> str | None:
+    """Return the objective of a tuning run, all that a table shows of it; None for another run."""
+    if tuning_share(run.about) is None:
+        return None
+    name = run.about["config"].get("objective")
+    return name if isinstance(name, str) else "online_return"

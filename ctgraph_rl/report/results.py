@@ -22,7 +22,7 @@ from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.tables import check_table, write_evaluations
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.bounds_of_runs import BoundsOfRuns, bounds_by_curriculum
-from ctgraph_rl.report.columns import WHERE_KNOWN, columns_of_runs
+from ctgraph_rl.report.columns import WHERE_KNOWN, columns_of_runs, objective
 from ctgraph_rl.report.formats import FORMATS, LEGENDS, NO_RUN_FINISHED, SENTENCES
 from ctgraph_rl.report.intervals import scipy
 from ctgraph_rl.report.names import displayed, modifications
@@ -73,7 +73,7 @@ class Row:
         definition: id of the metric's definition.
         note: why seeds have no value.
         seed: of one run; None for all seeds.
-        columns: metrics that tables show of its curriculum.
+        columns: measures that tables show of its agent on its curriculum.
     """
 
     curriculum: str
@@ -83,7 +83,7 @@ class Row:
     definition: str
     note: str
     seed: int | None = None
-    columns: Sequence[str] = ()
+    columns: tuple[str, ...] = ()
 
     @property
     def kind(self) -> str:
@@ -119,7 +119,7 @@ def table(runs: Sequence[Run], statistics: str = "exact", count: Count = silent)
         scipy("stats")
     for done, ((name, agent), by_seed) in enumerate(groups.items(), 1):
         for line in _lines(by_seed, bounds[name], statistics):
-            rows.append(Row(name, agent, *line, columns=shown[name]))
+            rows.append(Row(name, agent, *line, columns=_columns(by_seed, shown[name])))
         count("agents", done, len(groups))
     return rows
 
@@ -135,8 +135,15 @@ def rows_by_seed(runs: Sequence[Run]) -> list[Row]:
                 if measure != "interquartile_return":
                     note = "" if estimate.n else note
                     one = replace(estimate, low=None, high=None, method="one run", reason=None)
-                    rows.append(Row(name, agent, measure, one, definition, note=note, seed=seed, columns=shown[name]))
+                    shows = _columns(by_seed, shown[name])
+                    rows.append(Row(name, agent, measure, one, definition, note=note, seed=seed, columns=shows))
     return rows
+
+
+def _columns(by_seed: BySeed, shown: tuple[str, ...]) -> tuple[str, ...]:
+    """Return what tables show of an agent: the objective of tuning runs, else a curriculum's and the solved rate."""
+    tuned = objective(present(by_seed)[0])
+    return (*shown, "solved_rate") if tuned is None else (tuned,)
 
 
 def comparisons(runs: Sequence[Run], metric: str) -> dict[tuple[str, str, str], Comparison]:
@@ -166,8 +173,8 @@ def selected(rows: Sequence[Row], names: Sequence[str] | None = None, also: Sequ
     """Return the rows of some measures; agents without a finished run stay.
 
     Args:
-        names: of measures, ``solved`` for all tasks' shares; None: the curriculum's, the solved rate, and those of
-            `WHERE_KNOWN` with a value.
+        names: of measures, ``solved`` for all tasks' shares; None: the rows' columns, and those of `WHERE_KNOWN` with
+            a value.
         also: further measures.
 
     Raises:
@@ -176,11 +183,14 @@ def selected(rows: Sequence[Row], names: Sequence[str] | None = None, also: Sequ
     choices = dict.fromkeys(row.kind for row in rows if row.measure != NO_RUN_FINISHED)
     unknown = [name for name in names or () if name not in choices]
     require((not choices or not unknown, _no_measure(unknown, choices)))
-    known = {(row.curriculum, row.measure) for row in rows if row.measure in WHERE_KNOWN and row.estimate.n}
+    known = set()
+    for row in rows:
+        if row.measure in WHERE_KNOWN and row.estimate.n:
+            known.add((row.curriculum, row.columns, row.measure))
     found = []
     for row in rows:
-        wanted = (*row.columns, "solved_rate", *also) if names is None else names
-        is_known = names is None and (row.curriculum, row.measure) in known
+        wanted = (*row.columns, *also) if names is None else names
+        is_known = names is None and (row.curriculum, row.columns, row.measure) in known
         if row.kind in (*wanted, NO_RUN_FINISHED) or is_known:
             found.append(row)
     return found

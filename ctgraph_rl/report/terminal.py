@@ -18,7 +18,7 @@ from rich.text import Text
 from ctgraph_rl.checks import ReadOnlyValues, require
 from ctgraph_rl.log.escape import listed, terminal_text
 from ctgraph_rl.log.provenance import numbers_of
-from ctgraph_rl.report.columns import WHERE_KNOWN, columns
+from ctgraph_rl.report.columns import WHERE_KNOWN, columns, objective
 from ctgraph_rl.report.formats import measure_name
 from ctgraph_rl.report.names import modification
 from ctgraph_rl.runs.read import FOLDER, MOST_SEEDS, Curve, History, Problem, Run, code_of, read_run
@@ -82,6 +82,9 @@ def print_summary(run_dir: Path | str, console: Console | None = None) -> None:
     if modified:
         console.print(_text(f"{run.curriculum[0]}: {modified}"))
     always = columns(history.trained, bool(history.adaptation), "life" in run.about)
+    tuned = objective(run)
+    if tuned is not None:
+        always = (tuned,)
     if "life" in run.about:
         tables = [_life(name, run)]
     for table in (*tables, metrics_table(run.metrics, always)):

@@ -83,8 +83,13 @@ _PACKAGE = re.compile(r"(?:_target_|path): ['\"]?(\w+)")  # of a target, or of a
 
 
 def plain(cfg: DictConfig) -> NamedValues:
-    """Return the configuration as plain values, without Hydra's, those that do not change results, and empty groups."""
+    """Return the configuration as plain values, without Hydra's, those that do not change results, and empty groups.
+
+    A tuning run keeps its objective, which tables show.
+    """
     kept = [str(key) for key in cfg if key != "hydra" and key not in NOT_HASHED]
+    if cfg.get("objective_until") is not None:
+        kept.append("objective")
     values: Any = OmegaConf.to_container(OmegaConf.masked_copy(cfg, kept), resolve=True)
     return {key: value for key, value in values.items() if value != {}}
 
@@ -217,6 +222,11 @@ def check_settings(cfg: DictConfig) -> None:
             (is_share, f"{name} must be a share of the frames in (0, 1], such as 0.1, got {share!r}"),
             (share is None or "exchange" not in cfg, alone),
         )
+    until = cfg.objective_until
+    frozen = cfg.freeze_after
+    freezes = frozen is None or until is None or frozen < until
+    later = f"freeze_after={frozen} freezes nothing before objective_until={until}, where the run ends"
+    require((freezes, f"{later}: set freeze_after below {until}, or leave it out"))
     for switch in ("experts", "report", "portable", "together", "save_optimiser"):
         require((isinstance(cfg[switch], bool), f"{switch} must be true or false, got {cfg[switch]!r}"))
     evaluation = cfg.evaluation if isinstance(cfg.evaluation, DictConfig) else {}

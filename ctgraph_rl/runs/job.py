@@ -20,7 +20,7 @@ from ctgraph_rl.agent import Agent, MethodLike
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_int, plain, require, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.disk import is_writable
-from ctgraph_rl.learn.refusals import notes
+from ctgraph_rl.learn.refusals import check_share, notes
 from ctgraph_rl.learn.stacked import why_not_together
 from ctgraph_rl.learn.unit_metrics import unit_rules
 from ctgraph_rl.log.escape import terminal_text
@@ -101,6 +101,7 @@ def build(
     curriculum, make_agent = recipe_of(cfg) if recipe is None else recipe
     member = make_member(cfg, run_dir, curriculum, make_agent, settings=config.plain(cfg), interrupt=interrupt)
     usual = bool(cfg.get("plasticity")) and all(holds for holds, _ in unit_rules(curriculum, member.agent))
+    check_share(curriculum, member.agent, cfg.objective_until)
     member.log_units = usual if cfg.log_units is None else cfg.log_units
     if member.log_units:
         require(*unit_rules(curriculum, member.agent))

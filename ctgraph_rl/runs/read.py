@@ -291,7 +291,9 @@ def _tuning_notes(runs: Sequence[Run]) -> Iterator[Problem]:
         seeds = listed(sorted({run.seed for run in some}), MOST_SEEDS)
         runs_of = f"{len(some)} tuning run{'s' * (len(some) > 1)} of {agent} on {name}"
         what = f"{runs_of}: {trials} trial{'s' * (trials > 1)}, seeds {seeds}"
-        reason = f"{what}, the first {share:g} of the frames; --tuning shows them"
+        ends = {max(value.frames or 0 for value in run.values) for run in some if run.values}
+        ended = f", ended after {listed(sorted(ends), MOST_SEEDS)} frames" if ends else ""
+        reason = f"{what}, objective_until={share:g}{ended}; --tuning, in Python tuning=True, shows them"
         yield Problem(some[0].path, reason, is_error=False)
 
 
@@ -437,18 +439,20 @@ def _history(log: RunLog, values: Sequence[Value]) -> History:
 def grouped(runs: Sequence[Run]) -> dict[AgentKey, dict[int, Run | None]]:
     """Return runs by seed, for each (curriculum, agent); None for a seed that only other agents have.
 
+    Tuning runs and others expect no seeds of each other.
+
     Runs of a curriculum and agent stand at the first's place, by the settings in which they differ. A curriculum has
     its shortest name, with its fingerprint if another has the same.
     """
     groups: dict[tuple[Any, ...], dict[int, Run]] = {}
-    expected: dict[CurriculumKey, set[int]] = {}
+    expected: dict[Any, set[int]] = {}
     named: dict[CurriculumKey, str] = {}
     for some in split_by(runs, _kind).values():
         keys = _differing(some)
         for run in sorted(some, key=lambda run: [_rank(run.settings.get(key)) for key in keys]):
             groups.setdefault(run.configuration, {})[run.seed] = run
             if run.agent is not None:
-                expected.setdefault(run.group, set()).add(run.seed)
+                expected.setdefault((run.group, tuning_share(run.about)), set()).add(run.seed)
     for run in runs:
         named[run.group] = min(named.get(run.group, run.curriculum[0]), run.curriculum[0], key=len)
     several = repeated(named.values())
@@ -458,7 +462,7 @@ def grouped(runs: Sequence[Run]) -> dict[AgentKey, dict[int, Run | None]]:
         curriculum = named[one.group]
         if curriculum in several:
             curriculum += f" {one.group[1]}"
-        seeds = sorted(by_seed if one.agent is None else expected[one.group])
+        seeds = sorted(by_seed if one.agent is None else expected[one.group, tuning_share(one.about)])
         name = agent if one.shown is None else one.shown[1]
         found[curriculum, name] = {seed: by_seed.get(seed) for seed in seeds}
     return dict(sorted(found.items(), key=lambda item: min(map(_place, item[1].values()))))

@@ -81,6 +81,9 @@ class Sweeper(Base):
     done: ClassVar[Sequence[Path]] = ()
     """Run directories of this process's last finished sweep."""
 
+    tuning: ClassVar[bool] = False
+    """Whether some cells of that sweep are tuning runs."""
+
     def __init__(
         self,
         max_batch_size: int | None,
@@ -96,6 +99,7 @@ class Sweeper(Base):
         self._begun: dict[Path, tuple[int, ...]] = {}
         self._known: dict[str, NamedValues] = {}
         self._num_unknown = 0
+        self._has_tuning = False
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         """Set up as Hydra does; a launcher for all cores gets processes of ``num_threads`` each."""
@@ -158,6 +162,7 @@ class Sweeper(Base):
             sys.exit(EX_TEMPFAIL if left_over == {IN_USE} else 1)
         if not self.status:
             Sweeper.done = list(cells)
+            Sweeper.tuning = self._has_tuning
 
     def _combined(self, variant: ReadOnlyValues, arguments: Sequence[str]) -> list[list[str]]:
         own = [f"{key}={value}" for key, value in variant.items()]
@@ -215,6 +220,7 @@ class Sweeper(Base):
             for key, value in values.items():
                 OmegaConf.update(composed[alike], key, value)
             check_settings(composed[alike])
+            self._has_tuning |= composed[alike].objective_until is not None
             sweep = composed[alike].hydra.sweep
             folder = Path(sweep.dir).absolute() / sweep.subdir
             if folder not in found and self.config.overwrite is not True:

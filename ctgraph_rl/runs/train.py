@@ -24,7 +24,7 @@ from ctgraph_rl.checks import (
 )
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.learn.collect import agent_specs
-from ctgraph_rl.learn.refusals import check_adaptation, check_episodes, check_rows
+from ctgraph_rl.learn.refusals import check_adaptation, check_episodes, check_exact, check_rows
 from ctgraph_rl.log.files import CHECKPOINTS
 from ctgraph_rl.log.provenance import learners
 from ctgraph_rl.runs.checkpoints import Checkpoints
@@ -67,6 +67,7 @@ def new_agent(curriculum: Curriculum, make_agent: MakeAgent, seed: int, device: 
     check_rows(curriculum, agent.num_envs)
     check_episodes(curriculum, agent)
     check_adaptation(curriculum, agent)
+    check_exact(curriculum, agent)
     return agent
 
 

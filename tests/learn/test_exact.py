@@ -245,9 +245,12 @@ def test_what_has_no_exact_measures_is_refused_before_training(name, change, rea
     blocks = (Block((task, replace(task, goal=(2, 2))), 8192),)
     evaluation = Evaluation(exact=True, before=False)
     curriculum = Curriculum("own", 1, "none", blocks, evaluation=evaluation)
+    agent = make_agent(name, replace(curriculum, evaluation=Evaluation(before=False)))
 
     with pytest.raises(ValueError, match=reason):
-        learn_curriculum(curriculum, make_agent(name, curriculum))
+        make_agent(name, curriculum)
+    with pytest.raises(ValueError, match=reason):
+        learn_curriculum(curriculum, agent)
 
 
 def test_a_goal_that_changes_and_what_is_no_policy_have_no_exact_measures():

@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 
 from baselines.methods.finetune import Finetune
-from ctgraph_rl import Block, CTGraphEnv, Evaluation, Protocol, Recorder, learn_curriculum
+from ctgraph_rl import Block, CTGraphEnv, Evaluation, Protocol, Recorder, learn_curriculum, make_agent
 from ctgraph_rl.learn.collect import ENDS, collect, make_env, without_ends
 from ctgraph_rl.learn.refusals import check_episodes
 from ctgraph_rl.tasks.kinds.gym_task import GymTask
@@ -139,6 +139,8 @@ def test_only_agents_that_need_episodes_are_refused(compose):
         agent.unwrapped = type(KINDS[name].__name__, (), {"needs_episodes": True})()
         with pytest.raises(ValueError, match=rf"^{KINDS[name].__name__} needs the ends of episodes, which are hidden"):
             check_episodes(GRAPHS, agent)
+    with pytest.raises(ValueError, match=r"^RL2 needs .* ends of episodes, which protocol.episodes=hidden hides: set"):
+        make_agent("rl2", GRAPHS)
 
 
 @pytest.mark.parametrize(

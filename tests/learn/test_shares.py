@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from helpers.kill_runs import equal
 from helpers.scripted import ONE, THREE, TWO, Told, decide, lines, of, random_decision
@@ -122,7 +123,7 @@ def test_a_frozen_agent_acts_by_its_policy_for_the_announced_task_also_once_it_i
 
 def test_a_tuning_run_has_metrics_of_training_alone_and_tables_leave_it_out_unless_asked(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
-    tunes = ("objective=online_return", "objective_until=0.5")
+    tunes = ("objective=online_return", "objective_until=0.45")  # 231 frames, inside a batch that ends after 256
 
     assert command_line(monkeypatch, *SHORT, *tunes, "seed=100") == 0
     printed = capsys.readouterr().out
@@ -136,7 +137,9 @@ def test_a_tuning_run_has_metrics_of_training_alone_and_tables_leave_it_out_unle
     played = [(line["episodes"], line["return_mean"]) for line in log.of_kind("training") if line["episodes"]]
     value = objective_of("online_return", [run])
     assert value == sum(number * mean for number, mean in played) / sum(number for number, _ in played)
-    assert f"online_return after 0.5 of the frames: {value:.4f}" in printed
+    assert f"online_return after 256 frames (objective_until=0.45): {value:.4f}" in printed
+    assert f"ctgraph-rl report --tuning {run.relative_to(tmp_path)} makes a page" in printed
+    assert "online return" in printed and "undefined" not in printed
     metrics = metrics_of((run / "metrics.json").read_bytes())
     known = {name for name, metric in metrics.items() if metric["value"] is not None}
     assert known >= {"online_return", "regret", "open_loop_ceiling"}
@@ -148,4 +151,37 @@ def test_a_tuning_run_has_metrics_of_training_alone_and_tables_leave_it_out_unle
     results_main()
     said = capsys.readouterr()
     assert "n = 1" in said.out and "objective_until" not in said.out
-    assert "1 tuning run of PPO on su_b1_4tasks: 1 trial, seeds 100, the first 0.5 of the frames" in said.err
+    of_run = "1 tuning run of PPO on su_b1_4tasks: 1 trial, seeds 100, objective_until=0.45, ended after 256 frames"
+    assert f"{of_run}; --tuning, in Python tuning=True, shows them" in said.err
+    why = metrics["average_performance"]["undefined"]
+    assert why == "a tuning run, which ended after 256 of 512 frames, has only metrics of training"
+    monkeypatch.setattr("sys.argv", ["results", "runs", "--tuning"])
+    results_main()
+    shown = capsys.readouterr().out
+    _, tuned, untuned = shown.split("objective_until=")
+    assert tuned.split()[:4] == ["0.45", "online", "return", f"{value:.2f}"] and "n = 1 " in tuned
+    assert "None\n    average performance" in untuned and "n = 1 " in untuned
+    assert "n = 0" not in shown and "n = 1/2" not in shown
+
+
+@pytest.mark.parametrize(
+    ("settings", "reason"),
+    [
+        (
+            ("objective=online_return", "objective_until=0.12"),
+            "objective_until=0.12 is 62 of curriculum.num_frames=512, less than two batches of agent.num_envs=8 x",
+        ),
+        (
+            ("objective=online_return", "objective_until=0.5", "freeze_after=0.5"),
+            "freeze_after=0.5 freezes nothing before objective_until=0.5, where the run ends: set freeze_after below",
+        ),
+        (("agent=mohqa", "evaluation.exact=true", "evaluation.num_episodes=null"), "action_probs, which MOHQA has not"),
+    ],
+)
+def test_a_run_that_would_say_nothing_leaves_no_directory(monkeypatch, tmp_path, capsys, settings, reason):
+    monkeypatch.chdir(tmp_path)
+
+    assert command_line(monkeypatch, *SHORT, *settings) == 1
+
+    assert reason in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

@@ -57,6 +57,13 @@ def test_a_second_start_does_only_what_is_missing(learned, monkeypatch, capsys):
     assert sorted(path.name for path in Path("runs").iterdir()) == ["multirun.yaml", "su_b1_4tasks"]
 
 
+def test_a_sweep_of_tuning_runs_ends_with_the_command_that_shows_them(learned, monkeypatch, capsys):
+    assert sweep(monkeypatch, "seed=0,1", "objective=online_return", "objective_until=0.5") == 0
+
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last == "ctgraph-rl report --tuning runs/su_b1_4tasks makes a page of figures and tables"
+
+
 def test_a_sweep_that_is_done_ends_with_its_table_and_what_to_do_next(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     folders = [make_run(tmp_path, seed) for seed in (0, 1)]
@@ -65,6 +72,8 @@ def test_a_sweep_that_is_done_ends_with_its_table_and_what_to_do_next(tmp_path, 
     lines = capsys.readouterr().out.splitlines()
     show_sweep(folders * MOST_IN_TABLE)
     too_long = capsys.readouterr().out
+    show_sweep(folders * MOST_IN_TABLE, tuning=True)
+    tuned = capsys.readouterr().out
     monkeypatch.setitem(sys.modules, "scipy", None)
     show_sweep(folders)
     without_scipy = capsys.readouterr().out
@@ -72,6 +81,7 @@ def test_a_sweep_that_is_done_ends_with_its_table_and_what_to_do_next(tmp_path, 
     assert any(line.split()[:2] == ["average", "performance"] for line in lines)
     assert lines[-1] == "ctgraph-rl report . makes a page of figures and tables"
     assert too_long == "ctgraph-rl results . prints a table\n"
+    assert tuned == "ctgraph-rl results --tuning . prints a table\n"
     means = "for means, pip install 'ctgraph_rl[stats]'"
     assert without_scipy == f"ctgraph-rl results --per-seed . prints the runs; {means}\n"
 
