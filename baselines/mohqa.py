@@ -53,7 +53,6 @@ STATE = ("eligibility", "average", "trial")
 
 RMSPROP_ALPHA = 0.95
 RMSPROP_EPS = 0.01
-"""As published."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,7 +238,6 @@ class MOHQA(QLearner):
 
     @override
     def reset_parameters(self) -> None:
-        """The Hebbian weights and the average are 0 again."""
         super().reset_parameters()
         self.hebbian.weights.zero_()
         self.average.zero_()

@@ -260,7 +260,6 @@ class PEARL(Learner):
         self.replay = kept
 
     def _steps(self, row: Tensor, first: Tensor, last: Tensor, number: int) -> Items:
-        """Draw steps of trials with replacement, [num_trials, number]; row, first and last are [num_trials, 1]."""
         share = torch.rand(len(row), number, dtype=torch.float32, device=row.device)
         step = (first + (share * (last + 1 - first)).long()).minimum(last)
         return {key: value[row, step] for key, value in self.replay.items() if key != "begins"}

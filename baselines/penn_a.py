@@ -56,7 +56,6 @@ NEURONS = (False, False, False, False, True, True, True)
 """Which of the first individuals' neurons are modulatory; the first neuron acts."""
 
 FIRST_PRECISION = 10.0
-"""Of the mutation that makes the first individuals."""
 
 WEIGHTS = f"{UNSTORED}weights"
 OUTPUTS = f"{UNSTORED}outputs"
@@ -432,11 +431,6 @@ class PennA(TensorDictModuleBase):
         return measured
 
     def _learn_latents(self, seen: Tensor) -> float:
-        """Train the autoencoder on some of what was seen; return its mean loss.
-
-        Raises:
-            FloatingPointError: if that is not finite.
-        """
         total = torch.zeros_like(self.rewards[0])
         for _ in range(self.settings.num_updates):
             drawn = torch.randint(len(seen), (self.settings.batch_size,), device=seen.device)

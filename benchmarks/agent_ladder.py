@@ -36,13 +36,11 @@ GOALS = {"ppo": 10e6, "lstm_ppo": 1e6}
 """Environment steps a second for one agent to learn from."""
 
 MAIN_JOB = 4 * 204_800
-"""Frames of the main job's seed, LSTM-PPO on ``su_b1_4tasks``."""
 
 SEEDS_GOAL = 1024 * MAIN_JOB / (15 * 60)
 """Environment steps a second for 1,024 seeds of the main job in 15 minutes."""
 
 ENDLESS = 10**6
-"""More batches than are measured."""
 
 
 def rungs(device: torch.device, num_rows: Sequence[int], num_seeds: Sequence[int]) -> Iterator[Rung]:

@@ -40,7 +40,6 @@ ROWS = 256
 GOAL = (1, 2)
 SOLVED = 0.9
 CHUNK = 8192
-"""Frames between two evaluations."""
 
 TASKS = {"CT-FO-B1": ct_fo_b1(GOAL), "CT-SU-B1": ct_su_b1(GOAL), "CT-CO-B1": ct_co_b1(GOAL)}
 PAIRS = (
@@ -50,7 +49,6 @@ PAIRS = (
     ("lstm_ppo", "CT-SU-B1"),
     ("lstm_ppo", "CT-CO-B1"),
 )
-"""Agents and their tasks."""
 
 
 class Learning(Protocol):

@@ -36,10 +36,8 @@ T = TypeVar("T")
 Options = argparse.Namespace
 
 TimedRun = Callable[[], int]
-"""Runs for a while; returns the observations."""
 
 NUM_STEPS = 32
-"""Steps of a rollout."""
 
 COPY = "copy of the observations"
 GOAL, FUSED = 0.5e9, 5e9
@@ -184,7 +182,6 @@ WAYS: dict[str, Callable[[Sequence[Task], torch.device], TimedRun]] = {
     "rollout, captured": _captured,
     "rollout, fused and captured": _fused,
 }
-"""Ways to step, the slowest first."""
 
 
 def _prepared(tasks: Sequence[Task], device: torch.device) -> tuple[Rows, Steps, Tensor]:

@@ -39,11 +39,9 @@ MAX_BUFFER = 2**26
 
 
 NamedRuns = Iterator[tuple[str, TimedRun]]
-"""Ways to step, by name."""
 
 NOISE_BANK = 4096
 SUFFIX = {"off": "", "required": ", kernel"}
-"""Names of ways in the table by ``kernel``."""
 
 
 def configurations() -> dict[str, Task]:

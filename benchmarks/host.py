@@ -42,7 +42,6 @@ PARTS = {
     "checkpoint": ([(session, "offer_all")], 4, 4),
     "finish": ([(session.RunMember, "finish")], 1, 1),
 }
-"""The functions of each part, and how often a seed needs it here and in the main job."""
 
 
 class Costless(CapturedGroup):

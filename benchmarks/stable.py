@@ -19,7 +19,6 @@ from ctgraph_rl.gym import CTGraphGymEnv
 from ctgraph_rl.sb3 import SB3VecEnv
 
 DEFAULT_ROWS = 8
-"""For Stable-Baselines3's own settings."""
 
 KINDS = {"a2c": A2C, "ppo": PPO, "dqn": DQN, "lstm_ppo": RecurrentPPO}
 
@@ -72,7 +71,6 @@ class Stable:
         self.frames = max(num_rows * getattr(self.model, "n_steps", given["num_steps"]), 1024)
 
     def _exploration(self, given: Mapping[str, Any]) -> Callable[[float], float]:
-        """Return exploration that falls with the frames, not with the share of a ``learn`` call."""
         first = given["eps_init"]
         last = given["eps_end"]
         frames = given["annealing_num_steps"]

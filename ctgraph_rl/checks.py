@@ -25,16 +25,12 @@ Rule = tuple[bool, str]
 """Whether a rule holds, and the message if not."""
 
 NamedValues = dict[str, Any]
-"""Values by name, such as settings or a saved state."""
 
 ReadOnlyValues = Mapping[str, Any]
-"""The same, read-only."""
 
 LARGEST_INT = 2**63 - 1
-"""Of int64."""
 
 MOST_STREAMED = 100_000
-"""Most tasks of a stream."""
 
 LONGEST_NAME, LONGEST_PATH = 255, 4095
 """Bytes of a path's part, and of a path."""

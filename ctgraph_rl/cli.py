@@ -46,7 +46,6 @@ COMMANDS = {
     "submit": Command("ctgraph_rl.board.submit", "make a submission of runs, a folder that others can check"),
     "verify": Command("ctgraph_rl.board.verify", "check a submission by its files, reruns and held-out seeds"),
 }
-"""By name, each with its module and a line."""
 
 SETTINGS = {
     "curriculum=NAME": "what is learned; ctgraph-rl curricula lists them",
@@ -56,7 +55,6 @@ SETTINGS = {
     "curriculum.num_frames=1e5": "environment steps of each task",
     "agent.learning_rate=1e-3": "a hyperparameter of the agent",
 }
-"""Settings that are often changed, each with a line."""
 
 PARTS = {
     **{part: f"curricula {part}" for part in ("describe", "list", "probabilities")},
@@ -65,7 +63,6 @@ PARTS = {
     "sweep": "-m",
     **{option: f"--{option}" for option in ("help", "version")},
 }
-"""Parts of commands, options, and other programs' names of commands."""
 
 USAGE = """usage: ctgraph-rl COMMAND ...         each command has --help
        ctgraph-rl SETTING=VALUE ...    one run, such as ctgraph-rl curriculum=su_b1_4tasks agent=dqn

@@ -33,7 +33,6 @@ AGENT, FRAMES_PER_SECOND = "lstm_ppo", 18_000
 """An agent and its rough speed on one core, for estimates."""
 
 SECONDS_OF_AN_ID = 4e-8
-"""Further seconds a frame per number of a one-hot task id."""
 
 SECONDS_OF_A_MEAN = 2e-3
 """Time of an exact evaluation of a task of a stream, without memory."""
@@ -44,7 +43,6 @@ SECONDS_OF_A_STEP, SECONDS_OF_A_ROW = 5e-3, 1.3e-5
 OF_A_LIFE = "the present task, and at block ends of the next one and those 1, 10 and 100 blocks before"
 
 MOST_SHOWN = 20
-"""Blocks of a stream that are shown."""
 
 UNKNOWN = "-"
 
@@ -79,7 +77,6 @@ NOISE_AS_DICE = (
 )
 NEEDS_MEMORY = "Memory is needed: a deterministic agent without it, as in greedy evaluation, reaches at most"
 MOST_LOST = 4
-"""Most tasks in a note."""
 
 SAME_DECISIONS = "although decision states look alike, as all decisions on the way to the goal are the same."
 
@@ -158,7 +155,6 @@ def _neighbours(stream: Stream) -> str:
 
 
 def _time(curriculum: Curriculum, frames_per_second: float | None) -> str:
-    """Return how long learning takes at a rate; None: at that of `AGENT`, which is named."""
     if frames_per_second is not None:
         return f"{_duration(curriculum.num_frames / frames_per_second)} at {frames_per_second:,.0f} frames/s"
     protocol = curriculum.protocol

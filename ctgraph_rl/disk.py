@@ -20,7 +20,6 @@ from typing import BinaryIO
 from ctgraph_rl.checks import require
 
 PART = ".part"
-"""Ending of an unfinished file."""
 
 
 def write_whole(path: str | os.PathLike[str], content: bytes | str, synced: bool = True) -> None:

@@ -30,7 +30,6 @@ from ctgraph_rl.tasks.switch import Switch
 from ctgraph_rl.tasks.task import Task
 
 RowData = dict[str, Tensor]
-"""What rows show, by key."""
 
 
 class CTGraphEnv(EnvBase):
@@ -282,7 +281,6 @@ class CTGraphEnv(EnvBase):
         return self._keep_steps(super()._rollout_stop_early(**kwargs))
 
     def _keep_steps(self, steps: list[TensorDictBase]) -> list[TensorDictBase]:
-        """Keep the steps, which `rollout` stacks; return what the stock method stacks."""
         if self._steps is None:
             return steps
         self._steps.extend(steps)
@@ -325,7 +323,6 @@ class CTGraphEnv(EnvBase):
         return self._hide(shown) | {"reward": self.rows.reward.unsqueeze(-1)}
 
     def _hide(self, shown: Shown) -> RowData:
-        """Return the rows' data without ends of episodes, which `ends` keeps."""
         ends = {"done": shown.done, "outcome": shown.outcome, "leaf": shown.leaf}
         ends |= {"step_count": self.rows.step_count, "episode_reward": self.rows.episode_reward}
         self.ends = {key: value.unsqueeze(-1) for key, value in ends.items()}
@@ -364,7 +361,6 @@ class CTGraphEnv(EnvBase):
         return self._restart_data(self.rows.restart(done.squeeze(-1), observation), done, self._not_done())
 
     def _data(self, observation: Tensor, done: Tensor, is_init: Tensor, shown: Shown | Stepped) -> RowData:
-        """Return the rows' data but rewards; ``shown`` has the arrivals of done rows."""
         data = {"observation": observation, "is_init": is_init, "done": done, "terminated": done}
         if self.info:
             ends = {"outcome": shown.outcome.unsqueeze(-1), "leaf": shown.leaf.unsqueeze(-1)}

@@ -303,7 +303,6 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         return observation, rewards, never, done.copy(), infos
 
     def _restart(self, done: RowMask, final: Shown) -> tuple[Shown, NamedValues]:
-        """Start an episode in done rows; return what is shown then, and infos with what was shown last."""
         last = np.full(self.num_envs, None, dtype=object)
         for i, observation in zip(done.nonzero()[0], final.observation.numpy()[done], strict=True):
             last[i] = add_id(observation, self._ids, self._numbers[i])
@@ -315,7 +314,6 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         return shown, infos | self._infos(shown)
 
     def _infos(self, shown: Shown, mask: RowMask | None = None) -> NamedValues:
-        """Return `CTGraphGymEnv`'s ``info`` for a mask's rows, or all, as Gymnasium batches it."""
         values = {"task": self._numbers, "outcome": shown.outcome.numpy(), "leaf": shown.leaf.numpy()}
         infos: NamedValues = {}
         for key, value in values.items():

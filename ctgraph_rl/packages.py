@@ -18,7 +18,6 @@ from ctgraph_rl.checks import require
 HERE = Path(__file__).resolve().parent
 
 OF_REPORT = ("matplotlib", "jinja2", "scipy")
-"""Packages of the extra ``report``."""
 
 
 def makes_page(command: str) -> str:

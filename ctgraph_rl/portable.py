@@ -21,7 +21,6 @@ VARIABLES = {
     "MKL_CBWR": "COMPATIBLE",  # products of matrices: MKL's only code with the same bits on Intel's and AMD's CPUs
     "ONEDNN_MAX_CPU_ISA": "AVX2",  # convolutions
 }
-"""Environment variables of a portable process."""
 
 NEEDED = ("avx2", "fma")
 """Instructions of portable runs; libm takes those of FMA, too."""

@@ -99,10 +99,8 @@ Settings, KEY=VALUE; the yaml files of conf/ say what each means:
 --hydra-help shows the options that Hydra adds."""
 
 MOST_IN_TABLE = 50
-"""Cells of a sweep whose results are read at its end."""
 
 SEARCHERS = ("ax", "nevergrad", "optuna")
-"""Hydra's sweepers that search for the best value of a run."""
 
 
 class Stop(BaseException):

@@ -23,15 +23,12 @@ from ctgraph_rl.checks import NamedValues, ReadOnlyValues, as_path, is_shallow, 
 from ctgraph_rl.disk import in_words, read_regular
 
 MAX_NESTING = 32
-"""Most objects and lists within each other."""
 
 LONGEST_NUMBER = 40
-"""Digits of an integer."""
 
 LONG_NUMBER = re.compile("[0-9]" * (LONGEST_NUMBER + 1))
 
 MAX_DEPTH = 32
-"""Nesting of folders that are searched."""
 
 
 @contextmanager

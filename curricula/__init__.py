@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from ctgraph_rl.tasks.curriculum import Curriculum
 
 _MODULES = ("adaptation", "gym", "lives", "masks", "memory", "paper", "profile", "sharing", "task_free")
-"""Modules whose ``NAMED`` has their curricula."""
 
 _HOMES = {
     "MISSING": "published",

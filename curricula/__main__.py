@@ -38,7 +38,6 @@ def _compute(arguments: argparse.Namespace) -> None:
 
 
 def _show_list(rows: tuple[tuple[str, ...], ...], form: str) -> None:
-    """Print a line for each curriculum, with sources below on a terminal."""
     sheet = Sheet("Curricula", LISTED, rows)
     show([with_numbers(sheet) if form == "text" else sheet], form)
 

@@ -24,7 +24,6 @@ NM = "Ben-Iwhiwhu et al. 2022, Neural Networks; github.com/dlpbc/nm-metarl"
 UNANNOUNCED = Protocol(boundaries="hidden")
 
 MOST_LIVES = 10_000
-"""Each has two blocks."""
 
 
 def swoks_2x4(num_frames: int = 384_000) -> Curriculum:
@@ -179,7 +178,6 @@ def goal_search(num_frames: int = 409_600, depth: int = 2, num_image_sets: int =
 
 
 def _longest_episode(depth: int) -> int:
-    """Steps for p=0, the extra step at the end included."""
     return 2 * depth + 3
 
 

@@ -33,7 +33,6 @@ OneOrMore = Task | Iterable[Task]
 Axis = Callable[[Tasks], Tasks]
 
 MOST_TASKS = 100_000
-"""More are refused before they are built."""
 
 
 def as_tasks(tasks: OneOrMore) -> Tasks:

@@ -36,16 +36,13 @@ SWITCHES: dict[str, Callable[[int], Any]] = {
 IMAGE_SIZE = 12
 
 EVALUATIONS = 8
-"""Of a block, the last at its end."""
 
 ROWS = 256
 """Environments that evaluations within blocks must fit."""
 
 MOST_EVALUATED = 20
-"""Most tasks with evaluations within blocks."""
 
 TRIALS = 50
-"""Rows of an evaluation of a task whose goal changes."""
 
 
 @takes_its_kinds

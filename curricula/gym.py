@@ -102,6 +102,5 @@ def minigrid_3tasks(num_frames: int = 102_400) -> Curriculum:
 
 
 NEEDS = {"minigrid_3tasks": "minigrid"}
-"""Packages of extras by curriculum."""
 
 NAMED = by_name(frozen_lake_4maps, cartpole_3lengths, minigrid_3tasks)

@@ -20,7 +20,6 @@ SOURCE = "ctgraph_rl, after Mesbahi et al. 2025, arXiv 2404.02113"
 CONFLICT = "ctgraph_rl, after Abbas et al. 2023, arXiv 2303.07507"
 
 EVALUATIONS = 8
-"""Of a block, the last at its end."""
 
 
 def stream(

@@ -35,13 +35,10 @@ MOST_DEPTH = 16
 """Beyond it the images of `single_task` take gigabytes."""
 
 PATHS = {1: "01011010010101", 2: "11010101101110", 3: "00100110", 4: "10011100"}
-"""The consistent families."""
 
 SEED_SETS = {1: (1, 2, 3, 4), 2: (3, 4, 5, 6), 3: (5, 6, 7, 8), 4: (7, 8, 9, 10), 5: (9, 10, 11, 12)}
-"""The families' image seeds in each set of files."""
 
 FAMILIES = tuple(product(PATHS, range(2, 12)))
-"""The environments whose goals have the task ids."""
 
 DEPTH_3 = ((1, 3),)
 

@@ -68,7 +68,6 @@ def co_hard(
 
 
 def _with_unique_decisions(observations: Observations, count: int) -> Observations:
-    """Return observations with an id per decision state; later ids move up."""
     more = count - 1
     first, last = observations.decision_ids
     wait, last_wait = observations.wait_ids

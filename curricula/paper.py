@@ -28,7 +28,6 @@ from curricula.axes import Tasks
 PAPER = "Soltoggio et al. 2023, arXiv 2302.10887"
 
 KINDS = {"fo_b1": "full", "fo_b2": "full", "su_b1": "surjective", "co_b1": "confounding", "posr_b1": "surjective"}
-"""The observability of each configuration, a kind of `curricula.axes.observability`."""
 
 DEPTHS = (2, 3, 4, 5)
 DEEPEST_GOAL = (1, 2, 1, 2, 2)
@@ -61,7 +60,6 @@ MOST_DEPTH = 4
 """Changing goals are all tasks of one batch, evaluated for whole trials."""
 
 DISSIMILAR = {(2, 2): (1, 2), (3, 2): (3, 1), (2, 3): (2, 1, 2), (3, 3): (2, 3, 1)}
-"""Branching factor, depth and goal of tasks that share nothing."""
 
 
 def configured(configuration: str, image_seed: int = 1) -> Task:

@@ -33,10 +33,8 @@ EIGHT = ((1, 1, 1, 1), (2, 2, 1, 2), (1, 2, 2, 1), (2, 1, 2, 2), (2, 1, 1, 1), (
 """Goals of depth 4: each place has both branches four times."""
 
 SIMILAR = ((1, 1), (2, 2))
-"""Goals that share the first decision with `TARGETS`."""
 
 DISSIMILAR = ((2, 1), (1, 2))
-"""Goals that share no decision with `TARGETS`."""
 
 CURVE = 12
 """Evaluations of a block whose area counts; one greedy episode each suffices without chance."""
@@ -208,7 +206,6 @@ def profile_roles(num_frames: int = 98_304) -> Curriculum:
 
 
 def _life(name: str, before: Sequence[Task], num_frames: int) -> Curriculum:
-    """Return a block of half the frames for the tasks before, if any, and the block of `TARGETS`."""
     evaluation = Evaluation(10, before=False, every=num_frames // CURVE)
     if not before:
         return _profile(name, [TARGETS], num_frames, evaluation)
@@ -220,12 +217,10 @@ def _on_graphs(goals: Sequence[tuple[int, ...]], image_seeds: Sequence[int] = (1
 
 
 def _first_decisions(image_seeds: Sequence[int]) -> tuple[Task, ...]:
-    """Return the first decisions of `TARGETS` as goals, on images of some seeds."""
     return growing_depth(_on_graphs(MIRRORED[2], image_seeds), [1])
 
 
 def _relatives() -> list[Task]:
-    """Return graphs with the images of `TARGETS` and another first decision."""
     tasks: list[Task] = []
     for deep in _on_graphs(DISSIMILAR):
         tasks += [*growing_depth(deep, [1]), replace(deep, graph=replace(deep.graph, wait_prob=0.5))]
@@ -233,7 +228,6 @@ def _relatives() -> list[Task]:
 
 
 TARGETS = _on_graphs(MIRRORED[2])
-"""The last block of compared lives."""
 
 
 def _alternating(first: int, depth: int) -> tuple[int, ...]:

@@ -40,7 +40,6 @@ CT16_ORDERS = """
 4 3 13 14 12 8 10 5 11 15 7 2 0 6 9 1
 13 4 1 10 15 2 0 8 11 7 12 5 3 14 6 9
 """
-"""The tasks of agents 0 to 18."""
 
 
 def ct16(num_frames: int = 51_200, agent: int = 0) -> Curriculum:

@@ -23,13 +23,11 @@ TASK_FREE = "ctgraph_rl, after Zeno et al. 2018, arXiv 1803.10123, and Aljundi e
 HIDDEN = Protocol(boundaries="hidden")
 
 DIFFER = ("goals", "inputs", "both")
-"""What changes from task to task."""
 
 ROUNDS = ((0, 1, 2, 3), (1, 3, 0, 2), (3, 1, 2, 0))
 """Each task once per round, none twice in a row."""
 
 LONGEST_EPISODE = 7
-"""Steps of an optimal episode."""
 
 
 def task_free_abrupt(num_frames: int = 102_400, differ: str = "goals", image_seed: int = 1) -> Curriculum:

@@ -127,5 +127,4 @@ class Attention(Cell):
         return self.last_norm(y + self.narrower(wide))
 
     def _by_head(self, values: Tensor) -> Tensor:
-        """Return values as [rows, num_heads, steps, width]."""
         return values.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)

@@ -20,7 +20,6 @@ CellOutput = tuple[Tensor, CellState]
 """The output of a step, and the next state."""
 
 REWARD = "reward"
-"""Key of an agent's last reward."""
 
 
 class Units(NamedTuple):
@@ -28,8 +27,6 @@ class Units(NamedTuple):
 
     name: str
     linear: nn.Linear
-    """Its incoming weights, [units, inputs], and biases."""
-
     activation: nn.Module
     """What writes the units, [..., units]: a ReLU, or one behind a layer norm."""
 

@@ -18,11 +18,7 @@ class Segments(NamedTuple):
     """The frames in packed order, all first steps, then all second ones; int64 [rows * steps], row by row."""
 
     sizes: Tensor
-    """Number of sequences at each step, int64 [longest] on the CPU."""
-
     rows: Tensor
-    """The row of each sequence, int64 [num_sequences]."""
-
     at_first: Tensor
     """Whether a sequence begins at the first step of its row, bool [num_sequences]."""
 

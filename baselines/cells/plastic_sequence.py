@@ -162,7 +162,6 @@ class PlasticGradient:
         return Plastic(recurrent, plasticity, None if self._weights.rate is None else self._rate, *modulator)
 
     def _through_change(self, t: int, by_units: Tensor, state: CellState) -> tuple[Tensor, Tensor]:
-        """Go back through the change of fast weights; return the gradients by the units after and before it."""
         before = state[0]
         units = self._units[t]
         eta = self._eta[t]

@@ -84,8 +84,6 @@ class ADWIN(Detector):
             grace_period=grace_period,
         )
         self.kept: dict[int, Returns] = {}
-        """Of labels that were left."""
-
         self.start_label(0, trial=False)
 
     def observe(self, seen: Seen) -> Verdict:

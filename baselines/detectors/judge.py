@@ -27,8 +27,6 @@ class Judge(TakesNumbers):
     """
 
     reads: ClassVar[str] = ""
-    """What its verdicts depend on, in a few words."""
-
     needs: ClassVar[tuple[str, ...]] = ()
     """Optional fields of `Seen` that it reads: ``features``, ``observation_id``."""
 
@@ -36,10 +34,7 @@ class Judge(TakesNumbers):
     """Whether it reads where episodes end, and their returns."""
 
     is_oracle: ClassVar[bool] = False
-    """Whether it is given the curriculum."""
-
     changing: ClassVar[tuple[str, ...]] = ()
-    """Attributes that its verdicts depend on, tensors and plain values."""
 
     def __init__(self, max_labels: int | None, patience: int, snapshot_every: int | None) -> None:
         labels = is_int(max_labels, 1) or (max_labels is None and self.is_oracle)

@@ -21,7 +21,6 @@ from baselines.parts.embedding import sliced_distances, unit_directions
 from ctgraph_rl.checks import at_least_one, fraction, is_int, positive, require
 
 WINDOWS_BEFORE = 3
-"""A label's windows before its first distance."""
 
 
 class SWOKS(Detector):

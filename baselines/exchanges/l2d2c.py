@@ -20,7 +20,6 @@ SHARE = 0.9
 """A peer's mask is wanted if this share of its return exceeds one's return."""
 
 DIGITS = 6
-"""Decimals to which returns are compared."""
 
 
 class L2D2C(MaskExchange):

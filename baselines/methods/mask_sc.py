@@ -102,6 +102,5 @@ def is_prefix(one: Task, other: Task) -> bool:
 
 
 def _without_number(images: Any) -> Any:
-    """Return images with their own number, if any, set to 1."""
     number = getattr(images, "__dataclass_fields__", {}).get("num_images")
     return replace(images, num_images=1) if number is not None and number.init else images

@@ -91,7 +91,6 @@ class MaskShared(Masks):
         self.agent.weights_changed()
 
     def _keep(self, scores: Tensor) -> None:
-        """Keep received scores, [c, P], filled with zeros up to 1, 2, 4, 8 ... for compiled steps."""
         count = len(scores)
         room = 2 ** (count - 1).bit_length() if count and self.agent.compiled_step is not None else count
         excluded = room - count

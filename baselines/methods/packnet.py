@@ -20,7 +20,6 @@ from ctgraph_rl.checks import is_real, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 FREE = -1
-"""Owner of a free weight."""
 
 
 class PackNet(TaskMethod):

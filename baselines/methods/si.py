@@ -75,7 +75,6 @@ class SI(Importance):
 
     @override
     def weights_rewritten(self, change: Tensor) -> None:
-        """Nothing was learned by it."""
         self.start += change
 
     @override

@@ -12,7 +12,6 @@ from baselines.models.model import Symbols, Transitions
 from baselines.update.update import minimise
 
 WIDTH = 64
-"""Of the embedding and the GRU."""
 
 NUM_EPOCHS = 40
 

@@ -18,7 +18,6 @@ from ctgraph_rl.tasks.observability import transition_entropy
 from ctgraph_rl.tasks.task import Task, ct_graphs
 
 NUM_ROWS = 64
-"""Rows in which a policy meets a task."""
 
 
 class Transitions(NamedTuple):

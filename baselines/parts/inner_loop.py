@@ -246,7 +246,6 @@ class InnerPolicy(TensorDictModuleBase):
         return played.episodes(self.model.net, self.gamma, played)
 
     def _remember(self, data: TensorDictBase, rewards: Tensor, episode: Tensor, *, forgets: Tensor) -> None:
-        """Write the rows' steps, from the first one that a row still needs to the present one."""
         earlier = torch.where(forgets.unsqueeze(-1), 0, data[EPISODES])
         now = torch.where(episode <= self.adapt_episodes, episode, 0)
         numbers = torch.cat([earlier, now.unsqueeze(-1)], dim=1)
@@ -403,7 +402,6 @@ class InnerLoop(Learner):
         return found
 
     def _played(self, batch: TensorDictBase, rows: Tensor, chosen: Tensor) -> Played:
-        """Return steps of rows that are ``chosen``, bool [trials, steps of the batch]."""
         count = chosen.sum(dim=1, keepdim=True)
         place = torch.arange(int(count.max()), device=rows.device)
         first = chosen.int().argmax(dim=1, keepdim=True)

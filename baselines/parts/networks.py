@@ -24,19 +24,15 @@ from ctgraph_rl.learn.guide import GUIDED_ACTION
 from ctgraph_rl.learn.histories import can_branch, distinct, renumber
 
 Data = Mapping[Any, Tensor]
-"""Tensors by key, in a dictionary or a TensorDict."""
 
 Items = dict[Any, Tensor]
-"""Tensors by key, whose first dimension is a batch's."""
 
 TensorsByName = dict[str, Tensor]
-"""Such as losses, outputs and weights."""
 
 INPUT = "input_number"
 """Key of frames' numbers, int64, the same for the same inputs."""
 
 FEWEST_ROWS = 128
-"""Rows from which acting looks for equal histories."""
 
 MOST_ROWS = 0.25
 """Share of different histories up to which acting computes each once."""
@@ -274,12 +270,10 @@ class RecurrentModule(TensorDictModuleBase):
         return distinct([*seen, *own])[1]
 
     def _read(self, data: Data) -> tuple[list[Tensor], list[Tensor]]:
-        """Return what the encoder reads at all frames, [rows * steps, ...] each, and the cell's other inputs."""
         seen = [data[key].flatten(0, 1) for key in self.encoder.in_keys]
         return seen, [value.flatten(0, 1) for value in self._own(data)]
 
     def _sequences(self, data: Data) -> tuple[Tensor, Tensor, Tensor, CellState]:
-        """Return what `Cell.sequence` reads, one for all frames with the same inputs."""
         starts = data["is_init"].squeeze(-1)
         seen, own = self._read(data)
         examples, groups = renumber(data[INPUT].flatten()) if INPUT in data else distinct([*seen, *own])
@@ -299,7 +293,6 @@ class RecurrentModule(TensorDictModuleBase):
         return TensorDict(state | {key: zeros[key] for key in self.own_keys}, batch_size=[num_envs])
 
     def _own(self, data: Data) -> list[Tensor]:
-        """Return the last action, one-hot, and the last reward, if the cell reads them; 0 at ``is_init``."""
         found = []
         for key in self.own_keys:
             value = one_hot(data[key], self.cell.num_actions).float() if key == PREVIOUS_ACTION else data[key]
@@ -530,7 +523,6 @@ def log_probabilities(logits: Tensor) -> Tensor:
 
 
 def _normalised(logits: Tensor) -> Tensor:
-    """Return `log_probabilities` of finite logits, [..., n], without gradients in half the operations."""
     most = logits.amax(dim=-1, keepdim=True)
     return logits - (logits - most).exp().sum(dim=-1, keepdim=True).log().add(most)
 

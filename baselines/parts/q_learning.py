@@ -38,7 +38,6 @@ from ctgraph_rl.checks import (
 from ctgraph_rl.core.device import torchs_defaults
 
 LONGEST_TARGET = 10**4
-"""Most steps of a multi-step target, beyond any episode that replay can hold."""
 
 
 def require_replay(observation_spec: Composite, buffer_size: int, batch_size: int, size: int = 1) -> None:
@@ -110,7 +109,6 @@ class EpsilonGreedy(TensorDictSequential):
         return (1 - eps) * greedy + eps / values.shape[-1], written
 
     def _act(self, data: Data) -> tuple[Tensor, Items]:
-        """Return action values, [num_envs, num_actions], and the trunk's next state."""
         trunk, head = self.module[0].module[0].module
         written = trunk.act(data)
         values = head.module(written.pop(head.in_keys[0]))

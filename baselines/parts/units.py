@@ -19,11 +19,7 @@ class Reader(NamedTuple):
     """A layer that reads units."""
 
     weight: Tensor
-    """[outputs, inputs]."""
-
     bias: Tensor
-    """[outputs]."""
-
     columns: Tensor
     """The inputs of each unit, int64 [units, k]: several for a channel, and for a unit read at several steps."""
 
@@ -157,7 +153,6 @@ def _layer(
 def _reader(
     weight: Tensor, bias: Tensor, num_units: int, apart: int | None = None, within: int | None = None
 ) -> Reader:
-    """Return a reader of units that begin at every ``apart``-th of its first ``within`` inputs; None: of all."""
     inputs = torch.arange(within or weight.shape[1], device=weight.device)
     return Reader(weight, bias, inputs.view(-1, apart or len(inputs))[:, :num_units].T)
 

@@ -20,7 +20,6 @@ from ctgraph_rl.checks import NamedValues, TakesNumbers, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 STREAM = 0x91A571
-"""Added to the agent's seed for a plasticity's draws."""
 
 
 class Plasticity(TakesNumbers, PlasticityHooks):
@@ -31,20 +30,15 @@ class Plasticity(TakesNumbers, PlasticityHooks):
     """
 
     needs_boundaries: bool = False
-    """Whether it acts at task changes, which must be announced."""
-
     reads_units: ClassVar[bool] = False
     """Whether it acts on hidden units."""
 
     counts: tuple[str, ...] = ()
-    """Attributes that are changing numbers and are saved."""
-
     agent: Learner
 
     def __init__(self) -> None:
         super().__init__()
         self.num_started = 0
-        """Tasks that have started."""
 
     def attach(self, agent: Agent, curriculum: Curriculum) -> Agent:
         """Return the agent with this plasticity, to which a method can be attached.

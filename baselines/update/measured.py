@@ -11,7 +11,6 @@ from torch import Tensor
 from baselines.parts.networks import TensorsByName
 
 LARGEST_WEIGHT = 1e12
-"""Beyond this a network has diverged."""
 
 
 def table_of(steps: Sequence[TensorsByName]) -> Tensor:

@@ -152,7 +152,6 @@ class SeedGroup:
         return self._explored(outputs) if "action_value" in outputs else self._sampled(outputs)
 
     def _acted_in_turn(self, data: Items) -> Items:
-        """Return what the policies write, each computed as that of a single agent: over its histories."""
         written = []
         for number, learner in enumerate(self.learners):
             with self.random(number):
@@ -252,7 +251,6 @@ class SeedGroup:
     def _update(
         self, stack: Stack, minibatches: Sequence[Data], errors: dict[Learner, FloatingPointError]
     ) -> TensorsByName:
-        """Take a gradient step of a stack; return measurements, [seeds] each, and add to the learners' errors."""
         needs_weights = stack.learners[0].needs_weights
         batch = {key: torch.stack([each[key] for each in minibatches]) for key in minibatches[0]}
         measured = self._step(stack, batch)
@@ -278,7 +276,6 @@ class SeedGroup:
 
 
 Outputs = Callable[..., TensorsByName]
-"""A graph of operations on the tensors of a `Stack` that acts."""
 
 CACHED_BYTES = 2**23
 """A core's cache, of weights, gradients and moments."""

@@ -39,8 +39,6 @@ class Stack:
         names: dict[int, str] = {}
         turned = []
         self.first_name: dict[str, str] = {}
-        """The first name of each tensor by all of its names."""
-
         for name, tensor in named_tensors(first).items():
             self.first_name[name] = names.setdefault(id(tensor), name)
             if isinstance(tensor, nn.Parameter) and tensor.ndim == 2:

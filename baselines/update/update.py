@@ -52,16 +52,12 @@ class UpdateState(NamedTuple):
     """What an update reads and writes in place: tensors of one learner, or of several seeds."""
 
     weights: Sequence[Tensor]
-    """By which the losses are differentiated."""
-
     optimiser: Parts | torch.optim.Optimizer
 
     tensors: Mapping[str, Tensor] | None = None
     """Of several seeds, all parameters and buffers by name, [seeds, ...] each; None: the learner's."""
 
     names: Sequence[str] = ()
-    """Names of the weights among these tensors."""
-
     turned: Sequence[str] = ()
     """Names of matrices kept as [seeds, inputs, outputs], as the backward pass returns their gradients."""
 
@@ -212,7 +208,6 @@ def parts_of(optimiser: torch.optim.Optimizer) -> Parts | torch.optim.Optimizer:
 
 
 def _prepare_state(optimiser: torch.optim.Optimizer, parameter: Tensor, fused: bool) -> TensorsByName:
-    """Return a parameter's state, as PyTorch makes it; on a GPU with the step count there for CUDA graphs."""
     state = optimiser.state[parameter]
     if not state:
         device = parameter.device if fused or parameter.is_cuda else "cpu"

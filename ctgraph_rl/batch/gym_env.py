@@ -29,7 +29,6 @@ from ctgraph_rl.tasks.protocol import EPISODES
 T = TypeVar("T")
 
 NUM_PROBED = 20
-"""Steps of the test that an environment repeats."""
 
 
 class GymEnv(EnvBase):
@@ -358,12 +357,6 @@ def _repeats_rule(task: GymTask, key: Any) -> Rule:
 
 
 def _play_probe(task: GymTask, env: Any) -> list[Any]:
-    """Return what an episode of random actions shows.
-
-    Raises:
-        ValueError: if a step fails; names it.
-        FloatingPointError: for numbers that are not finite.
-    """
     observed, _ = make_forms(task)
     env.action_space.seed(0)
     shown: list[Any] = []

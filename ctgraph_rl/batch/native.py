@@ -18,7 +18,6 @@ from ctgraph_rl.core.rewards import KERNEL_REWARDS, RewardFn
 from ctgraph_rl.core.row_params import RowParams
 
 KERNELS = ("auto", "off", "required")
-"""The values of ``kernel`` of `Rows`."""
 
 
 def kernel_rule(kernel: object) -> Rule:
@@ -65,7 +64,6 @@ class Stepped(NamedTuple):
 
 
 Observed = tuple[Tensor, Tensor | None]
-"""What rows observe, uint8 [N, *shape], and which are done, bool [N]; None if none is."""
 
 
 class Native:
@@ -211,7 +209,6 @@ class Native:
         return after, wrong
 
     def _own_state(self, state: RowState, call: _Call) -> RowState:
-        """States that the kernel can read, checked unless the kernel made them."""
         last = self._state
         if last is not None and all(a is b for a, b in zip(state, last, strict=True)):
             return state

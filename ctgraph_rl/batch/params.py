@@ -163,7 +163,6 @@ def _taps(size: int, angles: int, device: torch.device) -> tuple[Tensor, Tensor]
 
 
 def _is_by_node(task: Task, kind: StateType) -> bool:
-    """Whether the image of each state of a kind has its node's number."""
     return task.observations.is_unique(kind) and not task.observations.legacy_index
 
 
@@ -274,7 +273,6 @@ def make_shared_bank(pool: tuple[Task, ...], num_rows: int, num_noises: int) -> 
 
 
 def _select_rows(part: Any, index: Tensor) -> Any:
-    """Return parameters of rows from those of their tasks; tables of all tasks are unchanged."""
     rows = {}
     for name, value in part._asdict().items():
         if isinstance(value, (LegacyIndex, Swap)):
@@ -291,4 +289,3 @@ _TABLES: dict[type, tuple[str, ...]] = {
     LegacyIndex: ("num_ids",),
     RewardParams: (),
 }
-"""Fields without an entry for each task."""

@@ -236,7 +236,6 @@ class Rows(TakesNumbers, nn.Module):
         self.native.bind(params, self.tables)
 
     def _start_episodes(self, mask: Tensor | None) -> None:
-        """Change to the tasks chosen for rows that start an episode; the host waits for the device."""
         if not self.tasks_change:
             return
         mask = torch.ones_like(self.task, dtype=torch.bool) if mask is None else mask

@@ -31,7 +31,6 @@ from ctgraph_rl.checks import positive, require
 from ctgraph_rl.disk import make_folder
 
 OLDEST = (0, 8)
-"""The first version of bubblewrap with all options."""
 
 OPTIONS = (
     *("--unshare-all", "--unshare-user", "--disable-userns", "--cap-drop", "ALL"),
@@ -40,10 +39,8 @@ OPTIONS = (
 """New name spaces but no further ones, no capability, no terminal; the process ends with its watcher."""
 
 SYSTEM = ("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32", "/etc/alternatives", "/etc/ld.so.cache")
-"""Programs and libraries."""
 
 PACKAGES = ("ctgraph_rl", "baselines", "conf", "curricula", "hydra_plugins")
-"""Folders of our packages, side by side."""
 
 GRAPHICS = ("nvidia*", "kfd", "dri")
 
@@ -51,7 +48,6 @@ OWN = {"/tmp": "tmp", "/dev/shm": "shm"}
 """Folders to write to, and their places in the folder of the process, with which they are counted."""
 
 KEPT = ("PATH", "LANG", "LC_ALL", "TZ", "CC", "LD_LIBRARY_PATH", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")
-"""Variables of the environment that a process gets."""
 
 REFUSED = {
     errno.EPERM: (
@@ -66,15 +62,12 @@ Libraries use others where one is missing (ENOSYS).
 """
 
 ALLOW, REFUSE = 0x7FFF0000, 0x00050000
-"""Actions of linux/seccomp.h."""
 
 CGROUPS = Path("/sys/fs/cgroup")
 
 MOST_FILES, MOST_OPEN, MOST_THREADS = 100_000, 4096, 1024
-"""Files in the folder, open files of a process, and threads of all processes."""
 
 LEAST_FREE = 10**9
-"""Bytes that stay free on the disk."""
 
 MOST_OUTPUT = 2**12
 """Last bytes of a process's output that are shown."""
@@ -85,7 +78,6 @@ SECONDS_BETWEEN_LOOKS = 0.5
 SECONDS_TO_START = 60
 
 CGROUP, SYSTEMD, THREADS = "a cgroup", "systemd", "threads"
-"""Ways to limit the memory of all processes together."""
 
 
 class Limits(NamedTuple):
@@ -294,7 +286,6 @@ def strip_privileges(folder: Path) -> None:
 
 
 def _limit_each(limits: Limits, shares_memory: bool) -> list[str]:
-    """Return the start of a command that limits each process, from the inside."""
     import resource  # here: only POSIX systems have it
 
     seconds = math.ceil(limits.seconds) * (os.cpu_count() or 1)
@@ -310,7 +301,6 @@ def _limit_each(limits: Limits, shares_memory: bool) -> list[str]:
 
 
 def _limit_together(limits: Limits, way: str | None, groups: Sequence[Path]) -> list[str]:
-    """Return the start of a command that limits the memory of all processes, from the outside."""
     if way == SYSTEMD:
         user = [] if os.geteuid() == 0 else ["--user"]
         values = (f"MemoryMax={limits.memory}", "MemorySwapMax=0", f"TasksMax={MOST_THREADS}")
@@ -423,7 +413,6 @@ def confined(
 
 
 def _needed(paths: Sequence[Path]) -> list[str]:
-    """Return the folders that Python and our packages need, and given ones, outer folders first."""
     sites = [path for path in sys.path if Path(path).name in ("site-packages", "dist-packages")]
     named: list[str | Path] = [*paths, sys.prefix, sys.base_prefix, *sites, *(home() / name for name in PACKAGES)]
     both = {*map(os.path.abspath, named), *map(os.path.realpath, named)}

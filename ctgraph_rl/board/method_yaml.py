@@ -41,7 +41,6 @@ compute:
   tuning_hours: null        # of the runs by which settings were chosen
 failed: {}                  # seeds of runs without results, each with the reason, such as {3: out of memory}
 """
-"""A ``method.yaml`` to fill in, with comments."""
 
 EXAMPLE: ReadOnlyValues = yaml.safe_load(TEMPLATE)
 
@@ -51,7 +50,6 @@ HOURS_APART, SHARE_APART = 0.01, 0.05
 """How far the hours of a ``method.yaml`` may be from those of the logs."""
 
 OURS = "ctgraph_rl"
-"""Stands for this package's repository."""
 
 
 class Kind(NamedTuple):
@@ -120,7 +118,6 @@ KINDS = {
 """Fields by dotted names; only ``track_version`` may be missing, which ``submit`` writes."""
 
 PARTS = ("code", "given", "tuning", "compute")
-"""Fields that hold others."""
 
 
 def read_method(path: Path) -> NamedValues:

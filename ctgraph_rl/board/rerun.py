@@ -43,16 +43,13 @@ MODULE = "ctgraph_rl.board.relearn"
 JOB = "job.json"
 
 SCORE = "average_performance"
-"""The metric that is compared unless a track names another."""
 
 BYTES = "bytes of the agent"
-"""The check of what is alike also where bits differ."""
 
 OTHER_SIZE = 0.1
 """Largest change of an agent's bytes, as a share, where bits may differ: other versions keep numbers in other forms."""
 
 NOT_OF_THE_RUN = ("MemoryError", "ModuleNotFoundError")
-"""Errors that limits and missing code cause here."""
 
 OWN_VERSION = ("ctgraph_rl", "python")
 """Versions that may differ between equal bits; the numbers version stands for this package's."""
@@ -116,7 +113,6 @@ def cells_of(submission: Submission, drawn: Sequence[SubmittedRun], folder: Path
 
 
 def _groups_of_experts(submission: Submission, runs: Sequence[SubmittedRun]) -> tuple[tuple[int, tuple[int, ...]], ...]:
-    """Return the tasks of single-task experts, from 1, each with the seeds that were one batch."""
     found: dict[tuple[int, tuple[int, ...]], None] = {}
     for run in runs:
         for each in experts_of(submission.log(run)) if run.finished else ():

@@ -32,7 +32,6 @@ RESCORED = LEVELS[0]
 NO_ROW: ReadOnlyValues = {}
 
 OF_OURS = "baselines."
-"""Start of the names of our classes."""
 
 MAY_BE_READ = ("", "the frames of each block")
 """What methods may read beside what the protocol gives: a track fixes the frames of its blocks."""

@@ -44,10 +44,8 @@ MOST_BYTES, MOST_BYTES_OF_A_LOG = 2**24, 2**26
 """Largest ``submission.json``, 16 MiB, and largest log, packed and unpacked, 64 MiB."""
 
 MOST_RUNS, MOST_SECONDS = 10_000, 1e9
-"""Of a submission, and of a run."""
 
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.=-]{0,119}")
-"""Names of runs and of their files."""
 
 NOT_COUNTED = ("versions", "machine", "num_threads", "cpu", "source", "num_frames")
 """Fields of a log's first line outside its sum; the fingerprint stands for source and frames."""
@@ -84,7 +82,6 @@ PARTS = {
     "curriculum": Field(OBJECT, "what was learned, see `Curriculum.to_json`"),
     "runs": Field(Kind(_are_runs, f"a list of 1..{MOST_RUNS:,}"), "an object for each seed"),
 }
-"""Keys of ``submission.json``."""
 
 RUN = {
     "run": Field(matching(NAME.pattern, "a name of a file"), "name of the run, and of its log in `logs/`"),
@@ -110,7 +107,6 @@ RUN = {
         "time of the run; runs of one group share it",
     ),
 }
-"""Keys of each of the ``runs``."""
 
 
 @dataclass(frozen=True)

@@ -141,7 +141,6 @@ def _experts(run: Run) -> dict[int, Path]:
 
 
 def _names(runs: Sequence[Run]) -> list[str]:
-    """Return each run's directory name, or its seed where names are equal or not fit for files."""
     names = [run.path.resolve().name for run in runs]
     usable = all(map(NAME.fullmatch, names)) and not repeated(map(str.lower, names))
     return names if usable else [f"seed{run.seed}" for run in runs]

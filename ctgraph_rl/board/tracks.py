@@ -31,10 +31,8 @@ TUNING_SEEDS = range(100, 200)
 """Seeds for choosing the hyperparameters of a submission."""
 
 HELD_OUT_SEEDS = range(10**6, 2**31)
-"""Seeds that a verifier draws from."""
 
 KEYS = ("version", "title", "measures", "breakthrough", "score", "less_given")
-"""Keys of a file's ``track``."""
 
 SCORES = (
     "adapted_return",
@@ -213,7 +211,6 @@ def tracks() -> tuple[Track, ...]:
 
 
 def _is_value(setting: str) -> bool:
-    """Return whether a setting is a value, such as ``curriculum.depth=2``, not the choice of a group."""
     return "." in setting.partition("=")[0]
 
 

@@ -19,7 +19,6 @@ MOST_SPLITS = 1_000
 """Splits of the scores up to which all are tried; else as many random ones."""
 
 SAMPLES = 4_000
-"""Of normal scores, for the power."""
 
 ROUNDING = 1e-9
 """Sums of scores that differ by less are equal."""
@@ -134,7 +133,6 @@ def _splits(count: int, found: int) -> np.ndarray:
 
 
 def _first(holds: Callable[[float], object], low: float, high: float, halvings: int = 40) -> float:
-    """Return where a rule begins to hold between two numbers; -inf if at the first."""
     if holds(low):
         return -math.inf
     for _ in range(halvings):

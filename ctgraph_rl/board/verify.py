@@ -42,23 +42,18 @@ from ctgraph_rl.runs.sweep import sigterm_exits
 from ctgraph_rl.strict import json_value
 
 NONE = "none"
-"""The level of a submission that fails the first."""
 
 SCHEMA = 1
 
 MOST_BYTES = 2**24
-"""Largest ``verification.json``."""
 
 LEAST_SECONDS = 600
-"""Least time limit of a process."""
 
 MOST_HOURS, LEAST_GB, MOST_GB = 10**5, 0.001, 10**6
-"""Bounds of a process's limits."""
 
 GB = 10**9
 
 NUMBERS = 2**63
-"""A verifier's number is below."""
 
 
 class Plan(NamedTuple):

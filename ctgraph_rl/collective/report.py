@@ -23,7 +23,6 @@ from ctgraph_rl.strict import files_below
 MEASURES = ("learning_time", "share_learned", "final_return")
 
 COLUMNS = (*RUN, "every", "drop_prob", "delay_prob", *MEASURES, *WHAT, "bytes", "helps")
-"""Of ``collectives.csv``, a row for each collective."""
 
 SHOWN = (
     *("curriculum", "agent", "method", "exchange", "num_members", "seed"),

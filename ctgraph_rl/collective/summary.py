@@ -27,7 +27,6 @@ from ctgraph_rl.runs.read import split_by
 COLLECTIVE = "collective.jsonl"
 
 FILES = (COLLECTIVE, "members.csv", "messages.csv", "helps.csv", METRICS)
-"""Files of a collective's directory, in the order of writing."""
 
 LAST = 5
 """Batches at the end of a block whose mean return is its final one, as in the raw data of MOSAIC."""
@@ -115,7 +114,6 @@ def read_collective(path: Path | str) -> Collective:
 
 
 def _learned(path: Path, number: int, about: ReadOnlyValues) -> Iterator[Learned]:
-    """Yield what a member learned in each block; by returns, where tasks have no goal."""
     log = RunLog.read(member_folder(path, number) / LOG)
     trained = log.of_kind("run")[0]["trained"]
     start = 0

@@ -62,7 +62,6 @@ class Shown(NamedTuple):
 
 
 StateAndShown = tuple[RowState, Shown]
-"""The next states, and what they show."""
 
 Batch = TypeVar("Batch", RowState, Shown)
 
@@ -258,7 +257,6 @@ def _paid(
 
 
 def _share(after: State, goal_leaf: Tensor, params: RowParams, uses: Uses) -> Tensor:
-    """float32: the rewards' shares, as if every row were at an end state."""
     tree = params.tree
     g = params.g
     arrival = Arrival(after.node - tree.first_leaf, goal_leaf, tree.branching_factor, g.depth, uses.max_depth)
@@ -322,7 +320,6 @@ def _cleared(state: RowState, mask: Tensor, uses: Uses) -> RowState:
 
 
 def _count_episode(state: RowState, mask: Tensor, params: RowParams) -> RowState:
-    """Begin an episode; after a goal's last one, draw a goal and its number of episodes."""
     g = params.g
     left = state.episodes_left
     words = draw(params.seed, params.row, state.tick, STREAM_GOAL)

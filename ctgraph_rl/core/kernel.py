@@ -26,7 +26,6 @@ from ctgraph_rl.checks import require
 from ctgraph_rl.disk import publish
 
 ROWS_A_THREAD = 2048
-"""Rows for which another thread pays."""
 
 
 def num_threads(num_rows: int, most: int) -> int:
@@ -125,12 +124,10 @@ def _made() -> ctypes.CDLL:
 
 
 def _name(key: str, content: bytes) -> str:
-    """The library's file name, of what decides its content and the content's SHA-256."""
     return f"native-{key}-{hashlib.sha256(content).hexdigest()}.so"
 
 
 def _found(folder: Path, key: str) -> Path | None:
-    """Return the existing library of a key; remove one whose content a crash changed."""
     for path in folder.glob(f"native-{key}-*.so"):
         with suppress(FileNotFoundError):  # another process has removed it
             _require_own(path)

@@ -13,7 +13,6 @@ from torch import Tensor
 from ctgraph_rl.core import kernel
 
 PhiloxWords = tuple[Tensor, ...]
-"""Words of 32 bits, int64 tensors in [0, 2**32)."""
 
 _WORD = 0xFFFFFFFF
 _MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)

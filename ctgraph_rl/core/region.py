@@ -14,10 +14,8 @@ from torch import Tensor
 from ctgraph_rl.core.device import captures
 
 Tensors = Mapping[Any, Tensor]
-"""Tensors by key."""
 
 OwnTensors = dict[Any, Tensor]
-"""Tensors by key, in a region's memory."""
 
 WARM_UP = 3
 """Calls before capture, which load kernels and make optimisers' state."""

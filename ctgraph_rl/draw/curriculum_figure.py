@@ -26,7 +26,6 @@ from ctgraph_rl.tasks.task import ct_graphs
 
 MOST_PANELS = 12
 MOST_LEVEL = 4
-"""End states up to which labels stand level."""
 COLUMNS = 3
 
 

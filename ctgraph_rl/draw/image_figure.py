@@ -21,7 +21,6 @@ COLUMNS = 8
 INCHES = 0.72
 """Side of an image with the gap to the next."""
 ROW, GAP = 1.22, 0.06
-"""Height of a line and gap between images, relative to `INCHES`."""
 
 
 class ImageLine(NamedTuple):
@@ -86,7 +85,6 @@ def _stored(task: Task, ids: list[int]) -> Tensor:
 
 
 def _reads(task: Task, shown: list[tuple[StateType, int]], count: int, seed: int) -> Tensor:
-    """Return observations of ids, uint8 [ids, count, *shape], by rows that show no other."""
     rows: list[Task] = []
     kinds: list[int] = []
     for kind, number in shown:

@@ -23,13 +23,10 @@ HOME_KEY = (HOME, 0)
 FAIL_KEY = (FAIL, 0)
 
 MOST_LEAVES = 32
-"""End states up to which a tree is drawn whole."""
 MOST_PATHS = 8
-"""End states drawn of a larger tree."""
 MOST_STUBS = 3
 """Stubs of left-out branches on each side of those drawn."""
 MOST_DECISIONS = 8
-"""Decisions up to which a goal is written out."""
 
 
 class Edge(NamedTuple):
@@ -88,7 +85,6 @@ class Layout:
         return {node: b - len(drawn) for node, drawn in self._branches().items() if len(drawn) < b}
 
     def _branches(self) -> dict[int, list[int]]:
-        """The decisions drawn at each decision state, ascending, in 1..b."""
         branches: dict[int, list[int]] = {node: [] for node, level in self.level.items() if level < self.graph.depth}
         for node in self.x:
             if node:

@@ -99,7 +99,6 @@ def render(
 
 
 def _show(panels: Pixels, observation: Pixels) -> None:
-    """Centre grey images in [N, size, size, 3]; pixels are repeated, or shrunk by their maximum."""
     one_hot = observation.ndim == 2
     size = panels.shape[1]
     images = _grid(observation) if one_hot else observation[:, 0]
@@ -120,7 +119,6 @@ def _show(panels: Pixels, observation: Pixels) -> None:
 
 
 def _grid(vectors: Pixels) -> Pixels:
-    """Return one-hot [N, K] as [N, rows, columns], nearly square."""
     n, entries = vectors.shape
     columns = math.ceil(math.sqrt(entries))
     rows = math.ceil(entries / columns)
@@ -156,7 +154,6 @@ def _draw_row(task: Task, kind: int, node: int, goal_leaf: int, size: int) -> Pi
 
 @lru_cache(maxsize=128)
 def _picture(graph: CTGraph, size: int, nodes: tuple[int, ...]) -> tuple[Pixels, dict[Key, Mark]]:
-    """Return the canvas of the whole tree or of the paths to two nodes, and the places of its states."""
     gap = 0.785 * size / (graph.depth + 1)
     home = Mark(size / 2, size / 14, min(size / 32, 0.5 * gap))
     fail = Mark(size * 0.925, size * 0.075, size / 25)
@@ -211,7 +208,6 @@ def _star(canvas: Pixels, mark: Mark, unit: float) -> None:
 
 @lru_cache(maxsize=1024)
 def _ring(inner: float, outer: float) -> NDArray[np.int64]:
-    """Offsets on the canvas between two circles, [m, 2]; a disc for a negative inner radius."""
     reach = math.ceil(outer * SCALE)
     axis = np.arange(-reach, reach + 1) / SCALE
     distance = np.hypot(axis[:, None], axis)
@@ -246,7 +242,6 @@ def _lines(canvas: Pixels, lines: Iterable[MarkLine], width: float, colour: int)
 
 
 def _to_rgb(canvas: Pixels) -> Pixels:
-    """Return colours [size, size, 3], the mean of each pixel's parts."""
     packed = np.pad(PALETTE, ((0, 0), (0, 1))).view(np.uint64)[:, 0]
     parts = packed[canvas].reshape(len(canvas) // SCALE, SCALE, -1, SCALE)
     total = parts[:, 0, :, 0] + parts[:, 0, :, 1] + parts[:, 1, :, 0] + parts[:, 1, :, 1]

@@ -16,10 +16,8 @@ from ctgraph_rl.tasks.similarity import MEASURES
 from ctgraph_rl.tasks.task import ct_graphs
 
 MOST_NUMBERS, MOST_LABELS = 8, 40
-"""Tasks up to which a heat map shows numbers and labels."""
 
 MOST_STREAMED_TASKS = 32
-"""Tasks of a stream that are compared, its first ones."""
 
 
 def draw_similarity(curriculum: Curriculum, path: Path | str) -> None:
@@ -62,7 +60,6 @@ def _draw_matrix(axes: Any, matrix: Tensor, title: str) -> Any:
 
 
 def _draw_labels(axes: Any, labels: Sequence[str], is_lowest: bool, is_leftmost: bool) -> None:
-    """Name the tasks at the outer panels only: labels take most of a figure's time."""
     if len(labels) > MOST_LABELS:
         axes.set(xlabel="task, from 0", ylabel="task, from 0")
         return

@@ -20,7 +20,6 @@ from ctgraph_rl.draw.pixels import GOAL, PALETTE
 from ctgraph_rl.parsers import DPI
 
 MARKERS = {StateType.HOME: "p", StateType.WAIT: "o", StateType.DECISION: "D", StateType.END: "s", StateType.FAIL: "8"}
-"""Pentagon, circle, diamond, square and octagon."""
 
 PlanePoint = tuple[float, float]
 

@@ -32,10 +32,8 @@ PerAction = Mapping[Any, Any]
 ROOM, ROOM_FOR_NUMBERS = 30.0, 50.0
 """Points between end states from which actions, loops and ways to fail are drawn, and numbers at them."""
 MOST_WAIT_LEVELS = 6
-"""Depth up to which a tree that is not whole has wait states."""
 LARGEST_MARK = 24.0
 LEGEND_WIDTH = 5.5
-"""Inches of a legend in one line."""
 SMALLEST_TEXT = 4.0
 INITIALS = {kind: kind.name[0] for kind in StateType}
 GREY = "0.65"
@@ -164,7 +162,6 @@ class _TaskPicture:
                 self._write_at_edge(edge, line)
 
     def _is_strong(self, edge: Edge) -> bool:
-        """Black: the likeliest action, else what was visited, else the path to the goal."""
         chances = self.policy.get(edge.start)
         if chances is not None and edge.action is not None:
             return chances[edge.action] == max(chances)
@@ -180,7 +177,6 @@ class _TaskPicture:
         return 1.6 if self._is_strong(edge) else 0.8
 
     def _write_at_edge(self, edge: Edge, line: Sequence[PlanePoint]) -> None:
-        """The action, its probability and its value, on the edge; further down, where edges are apart."""
         if edge.action is None:
             return
         numbers = self._numbers(edge.start, (edge.action,))
@@ -250,7 +246,6 @@ class _TaskPicture:
         return offset_copy(self.axes.transData, fig=self.axes.figure, x=x, y=y, units="points")
 
     def _draw_ways_to_fail(self) -> None:
-        """A short dashed arrow at each state where an action fails, as wide as that is likely."""
         base = {"arrowstyle": "<|-", "linestyle": DASHES, "color": colour(FAIL), "shrinkB": 0, "mutation_scale": 6}
         for (kind, node), place in self.places.items():
             if kind in (WAIT, DECISION):

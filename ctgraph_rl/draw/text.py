@@ -44,7 +44,6 @@ def _place(task: Task, kind: int, node: int, goal_leaf: int, step_count: int) ->
 
 
 def _blocks(observation: NDArray[np.uint8], white: int) -> str:
-    """Return an image as lines of two grey blocks a pixel; a vector as one line."""
     pixels = observation.reshape(-1, observation.shape[-1]).astype(int)
     lines = []
     for levels in (pixels * 4 // white).clip(0, 4):

@@ -52,8 +52,6 @@ def _parts(shown: Any) -> tuple[Any, Any]:
 
 
 class _NumpyPolicy:
-    """A function of NumPy arrays that acts on TensorDicts and remembers from step to step."""
-
     def __init__(self, act: Callable[[Any, Any, Any], tuple[Any, Any]], discrete: bool = True) -> None:
         self.act = act
         self.discrete = discrete

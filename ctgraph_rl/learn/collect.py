@@ -35,7 +35,6 @@ TRIAL = "trial"
 """A recurrent state with this key lasts over episodes: the policy resets it itself, where a trial begins."""
 
 PREVIOUS_ACTION = "previous_action"
-"""Key of the last action in a recurrent state, int64 [rows]."""
 
 ENDS = "ends"
 """Key under ``next`` of what hidden episodes hide of their ends; no learner gets it."""
@@ -46,7 +45,6 @@ one, and, under ``next``, the value after the last one.
 """
 
 Step = dict[Any, Tensor]
-"""Data of one step of all rows; ``("next", key)`` holds what followed."""
 
 
 @takes_numbers
@@ -110,7 +108,6 @@ def agent_specs(curriculum: Curriculum) -> Specs:
 
 
 def _pool_and_ids(curriculum: Curriculum) -> tuple[Sequence[TaskLike], int]:
-    """Return all tasks, held-out ones too, and the length of shown task ids, or 0."""
     how = curriculum.protocol
     held_out = curriculum.evaluation.held_out
     pool = (*curriculum.tasks, *held_out) if held_out else curriculum.tasks

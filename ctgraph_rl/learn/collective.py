@@ -43,7 +43,6 @@ class ExchangeLike(Protocol):
     drop_prob: float
     delay_prob: float
     kinds: Sequence[str]
-    """The kinds of messages in the order in which they are sent within an exchange."""
 
     def settings_of(self, member: int) -> ReadOnlyValues:
         """Return this member's special settings, such as ``{"agent.learning_rate": 0.01}``."""
@@ -158,8 +157,6 @@ def _check(members: Sequence[Member], exchange: ExchangeLike) -> None:
 
 
 class _Learner:
-    """A member that learns batch by batch, with a separate state of torch's global generator."""
-
     def __init__(self, number: int, member: Member, device: torch.device, saved: SavedState | None) -> None:
         self.number = number
         self.member = member

@@ -411,7 +411,6 @@ class InTurn:
 
 
 def _join_policies(agent: Agent, policies: Sequence[Policy]) -> Policy:
-    """Return the agent's policy if all tasks have it, else one that acts for each task in its slice of rows."""
     return agent.policy if all(policy is agent.policy for policy in policies) else by_slices(policies)
 
 

@@ -34,7 +34,6 @@ from ctgraph_rl.tasks.task import Task, are_graphs
 from ctgraph_rl.tasks.values import Measures, policy_measures
 
 LEAST_STAY = 1e-12
-"""Probability below which a stay in a wait state is left out."""
 
 MOST_HISTORIES = 2**22
 """Most histories that are played: 10 s of an LSTM on one core."""
@@ -168,7 +167,6 @@ def count_histories(task: Task, reads_actions: bool) -> float:
 
 
 def _longest_stay(wait_prob: float) -> int:
-    """Return the steps in a wait state after which staying on is less likely than `LEAST_STAY`."""
     return 1 if wait_prob == 0 else 1 + math.ceil(math.log(LEAST_STAY) / math.log(wait_prob))
 
 
@@ -296,7 +294,6 @@ class _Enumeration:
         return self.task.goal_reward * self.task.reward_fn(arrival).double()
 
     def _at_home(self, histories: _Histories) -> None:
-        """Take the first step, with any action."""
         seen, probs, written = self._act(histories, StateType.HOME, 0, is_init=True)
         self._count_steps(seen)
         for action in range(probs.shape[1]) if PREVIOUS_ACTION in seen.state else [-1]:
@@ -304,7 +301,6 @@ class _Enumeration:
             self._at_wait(self._after(seen, written, chance, action), 0)
 
     def _at_wait(self, histories: _Histories, level: int) -> None:
-        """Wait until the next state; another action fails."""
         for part in _parts(histories):
             p = self.task.graph.wait_prob
             staying = part
@@ -324,7 +320,6 @@ class _Enumeration:
                 self._at_decision(leads_on, level)
 
     def _at_decision(self, histories: _Histories, level: int) -> None:
-        """Decide; another action fails."""
         graph = self.task.graph
         b = graph.branching_factor
         for part in _parts(histories):

@@ -15,7 +15,6 @@ GUIDED_ACTION = "guided_action"
 
 
 GUIDED = "guided"
-"""Key that says which rows are in a guided episode."""
 
 
 def guided_share(frames: int, guide_frames: int) -> float:

@@ -98,8 +98,6 @@ class Tree(NamedTuple):
     """What each continues: its place among the states of `initial`, followed by the histories; int64."""
 
     sizes: list[int]
-    """Histories of each length."""
-
     of_frames: Tensor
     """The history of each frame, int64 [rows * steps]."""
 
@@ -122,7 +120,6 @@ def tree(numbers: Tensor, starts: Tensor) -> Tree:
 
 
 def _lengths(starts: Tensor) -> Tensor:
-    """Return the steps of each frame since its episode or the batch started."""
     time = torch.arange(starts.shape[1], device="cpu")
     return (time - torch.where(starts, time, 0).cummax(dim=1).values).flatten()
 

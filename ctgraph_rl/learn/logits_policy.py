@@ -50,11 +50,6 @@ class LogitsPolicy:
         return logits.softmax(-1), {}
 
     def _logits(self, data: TensorDictBase | Step) -> Tensor:
-        """Return the logits of all rows.
-
-        Raises:
-            ValueError: if the module fails or gives anything else; says what to write.
-        """
         name = type(self.module).__name__
         shape = list(data["observation"].shape)
         fix = "write one that does, or a function of a TensorDict that sets 'action', or a TensorDictModule"

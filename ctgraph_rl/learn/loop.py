@@ -219,8 +219,6 @@ class Lockstep:
             self.evaluators.append(Evaluator(curriculum, seed, log, device, untrained))
         self.frames: int = 0 if saved is None else saved[0]["frames"]
         self.failed: dict[int, FloatingPointError] = {}
-        """Errors of failed members by their position."""
-
         for number, state in enumerate(saved or ()):
             if "failed" in state:
                 self.failed[number] = FloatingPointError(state["failed"])
@@ -313,7 +311,6 @@ class Lockstep:
         return data.set("is_init", torch.zeros_like(data["is_init"]))
 
     def _policy(self, segment: Segment, saved: Sequence[SavedState] | None) -> Policy:
-        """Return what acts in a segment: of an agent that was frozen before it, the policy for the announced task."""
         task = announced_id(self.curriculum, segment.blocks[0])
         if task is None or segment.start < self.last_learned:
             return self.group.policy
@@ -456,11 +453,6 @@ def run_loop(
 
 
 def _require_finite(measured: Learnt) -> dict[str, float]:
-    """Return what was measured.
-
-    Raises:
-        FloatingPointError: the error in its place, or one that names what is not finite.
-    """
     if isinstance(measured, FloatingPointError):
         raise measured
     for name, value in measured.items():

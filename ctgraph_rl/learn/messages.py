@@ -66,7 +66,6 @@ class Mail:
         """Messages by kind and by what happened to them, since the last `begin`."""
 
         self.bytes: Counter[str] = Counter()
-        """Bytes sent by kind of message, since the last `begin`."""
 
     def begin(self) -> None:
         """Begin an exchange: late messages of the last one arrive, and counts start at zero."""

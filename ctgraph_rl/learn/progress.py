@@ -15,10 +15,8 @@ if TYPE_CHECKING:
 SECONDS_BETWEEN_LINES = 10.0
 
 QUICK = 2.0
-"""Seconds in which a command shows nothing."""
 
 Count = Callable[[str, int, int], object]
-"""Takes the name of steps, how many are done and how many there are."""
 
 
 def silent(what: str, done: int, total: int) -> None:

@@ -160,7 +160,6 @@ def log_training(
 
 
 def _split_at_ends(batch: TensorDictBase, rows: int, start: int, ends: Sequence[int]) -> Iterator[TensorDictBase]:
-    """Yield the parts of a batch within one block, where a learner has so many rows."""
     steps = batch.shape[1]
     first = bisect_right(ends, start)
     last = bisect_left(ends, start + rows * steps)

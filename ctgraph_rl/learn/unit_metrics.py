@@ -27,10 +27,8 @@ THRESHOLDS = (0, 0.025, 0.1)
 """Largest scores of dormant units."""
 
 NUM_FRESH = 256
-"""Fresh images."""
 
 FRESH_SEED = 2**62 - 1
-"""Of the fresh images, beyond the seeds that curricula draw."""
 
 EACH_BATCH = "batch"
 """Of ``log_units``: measure after each batch, too; True: at starts, ends and evaluations of blocks."""
@@ -76,7 +74,6 @@ def unit_metrics(layers: LayersByName) -> dict[str, float]:
 
 
 def _ranks(rows: Tensor) -> dict[str, float]:
-    """Return the ranks of rows, float64 [n, H], as shares of min(n, H)."""
     sigma = torch.linalg.svdvals(rows)
     total = sigma.sum()
     if total == 0:

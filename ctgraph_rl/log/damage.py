@@ -16,7 +16,6 @@ from ctgraph_rl.log.sums import FILES, stored_sums
 from ctgraph_rl.strict import json_value, sha256_of
 
 MOST_BYTES_OF_A_FILE = 2**33
-"""Largest file whose sum is computed: 8 GiB."""
 
 
 def damaged(run_dir: Path) -> list[str]:

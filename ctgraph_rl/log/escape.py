@@ -91,7 +91,6 @@ def csv_text(rows: Iterable[Iterable[Any]], end: str = "\n") -> str:
 
 
 def _line(row: Iterable[Any]) -> str:
-    """A line without its end; cells with any end of line are quoted."""
     file = io.StringIO(newline="")
     csv.writer(file, lineterminator="\r\n").writerow(map(_cell, row))
     return file.getvalue().removesuffix("\r\n")

@@ -18,16 +18,12 @@ LOG, AGENT, METRICS, CURRICULUM = "run.jsonl", "agent.pt", "metrics.json", "curr
 """Files of a run; `METRICS` is there when it is complete."""
 
 FAILURE = "failed.txt"
-"""Why a run ended by an error."""
 
 MOST_BYTES_OF_METRICS, MOST_BYTES_OF_A_REASON = 2**24, 2**16
-"""Largest `METRICS`, and `FAILURE` or `LOCK`, that are read."""
 
 CHECKPOINTS = "checkpoints"
-"""The folder of an unfinished run's checkpoints."""
 
 LOCK = ".lock"
-"""Names the process that has locked a directory."""
 
 WITH_LOCKS = (
     "keep runs on a file system with locks (flock): set hydra.run.dir, with -m hydra.sweep.dir, and experts_dir"
@@ -37,13 +33,11 @@ EX_TEMPFAIL = 75
 """Exit code of a command whose directory another process writes, so that a queue tries again."""
 
 SECONDS_BETWEEN_ATTEMPTS = 0.5
-"""To get a lock."""
 
 BY_WAY_OF = b"\nby way of "
 """Stands in a lock file between who has the directory and the lock file that is locked for it."""
 
 ATTEMPTS_TO_READ = 10
-"""To read who has a lock, within half a second."""
 
 
 def member_folder(folder: Path, number: int) -> Path:
@@ -219,7 +213,6 @@ def _is_locked(file: BinaryIO) -> bool:
 
 
 def _is_still_there(file: BinaryIO, path: Path) -> bool:
-    """Whether the last holder has not removed it before we locked it."""
     try:
         return path.stat().st_ino == os.fstat(file.fileno()).st_ino
     except FileNotFoundError:

@@ -183,7 +183,6 @@ def by_windows(log: RunLog) -> RunLog:
 
 
 def _mean_line(lines: Sequence[NamedValues]) -> NamedValues:
-    """Return the means of lines, by episodes where they count them, and the last line's place."""
     line: NamedValues = {"frames": lines[-1]["frames"], "seconds": lines[-1].get("seconds", 0.0)}
     for name in ("return_mean", "success_rate", "end_rate", "length_mean"):
         known = [m for m in lines if m.get(name) is not None]

@@ -19,7 +19,6 @@ from ctgraph_rl.checks import (
 from ctgraph_rl.strict import MAX_NESTING, json_value
 
 MOST = 10**6
-"""Largest number of a block or task: the length of tables."""
 
 MOST_FRAMES = 2**63 - 1
 
@@ -86,14 +85,12 @@ RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
         (_is_number, f"a number of at most {LARGEST:g}"),
     ),
 }
-"""Rules for fields."""
 
 NEEDED = {
     "training": ("block", "frames"),
     "evaluation": ("block", "frames", "task", "return_mean"),
     "adaptation": ("block", "frames", "task", "step", "return_mean"),
 }
-"""Fields of the kinds in tables."""
 
 
 def parsed(line: bytes) -> NamedValues:

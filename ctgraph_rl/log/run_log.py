@@ -45,16 +45,13 @@ from ctgraph_rl.metrics import Column, Curves, Regime, RegimeTable, Trained
 from ctgraph_rl.metrics.adaptation import Adaptation
 
 MOST_CELLS = 10**7
-"""Largest table of a log."""
 
 MOST_BYTES = 2**30
-"""Largest log, 1 GiB."""
 
 MOST_MEMORY, BYTES_OF_A_VALUE = 2**32, 100
 """Memory of a log, 4 GiB, and bytes per value, as small records grow many times."""
 
 VALUES = (b",", b":", b"{", b"[", b"\n")
-"""Stands between JSON values."""
 
 FEW, BYTES_OF_A_NUMBER = 1000, 4
 """Blocks and tasks of a log of any size, and file bytes for each more."""
@@ -63,13 +60,11 @@ FEW_CELLS, CELLS_OF_A_BYTE = 10**4, 16
 """Cells of a table of a log of any size, and more per file byte."""
 
 BROKEN = "restore the file, or run again"
-"""What to do about a broken line."""
 
 SCHEMA = 1
 """Rises when the meaning of a line changes; fields may be added without."""
 
 BEGINNING = b'{"kind": "run"'
-"""Of a log's first line."""
 
 
 class RunLog:
@@ -97,7 +92,6 @@ class RunLog:
                 self._write_to(file)
 
     def _write_to(self, file: BinaryIO) -> None:
-        """Append to a file from now on, opened for each line, so that thousands of logs can be written at once."""
         self._path = Path(os.fsdecode(file.name)).absolute()  # a program may change its directory
         self._found = os.fstat(file.fileno())
 
@@ -412,7 +406,6 @@ class RunLog:
         return tuple(map(tuple, trained))
 
     def _said(self) -> list[list[int]]:
-        """Each block's tasks, from 0, if the first line says them."""
         for run in self.of_kind("run"):
             if "trained" in run:
                 return [[number - 1 for number in block] for block in run["trained"]]

@@ -29,7 +29,6 @@ _GLOBALS = re.compile(
 """Names in a pickle of tensors and plain values; `torch.load` by itself also makes arrays of any size."""
 
 _FOLLOWS = {"_codecs encode": "BINUNICODE", "collections OrderedDict": "EMPTY_TUPLE"}
-"""Arguments of these, so that no result grows again and again."""
 
 
 def read_content(path: Path) -> bytes:
@@ -112,7 +111,6 @@ def view_bits(tensor: torch.Tensor) -> torch.Tensor:
 
 
 def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the tensors, plain values and empty parts of a value, by place."""
     if isinstance(value, Mapping) and value:
         for key, item in value.items():
             yield from _leaves(item, f"{name}/{key!r}")
@@ -149,7 +147,6 @@ def require_records(content: bytes) -> None:
 
 
 def _check_sizes(content: bytes, records: list[zipfile.ZipInfo]) -> None:
-    """Refuse compressed or overlapping records, and a second list of records."""
     end = len(content) - 22
     large = content[end - 20 : end - 16] == b"PK\x06\x07"
     one_list = (
@@ -168,7 +165,6 @@ def _check_sizes(content: bytes, records: list[zipfile.ZipInfo]) -> None:
 
 
 def _names(pickled: bytes) -> Iterator[tuple[str, str]]:
-    """Yield a pickle's names, each with the kind of what follows."""
     known: dict[Any, str] = {}
     name = ""
     last = ""
@@ -183,7 +179,6 @@ def _names(pickled: bytes) -> Iterator[tuple[str, str]]:
 
 
 def _named(operation: str, argument: Any, known: dict[Any, str]) -> str:
-    """Return the name that an operation stacks; empty for a plain value."""
     if operation == "GLOBAL":
         return argument
     if operation in ("STACK_GLOBAL", "INST", "EXT1", "EXT2", "EXT4", "OBJ", "MEMOIZE"):

@@ -39,7 +39,6 @@ NO_STREAM = Undefined("windows are those of a stream, as curriculum=stream makes
 NO_EXPERTS = "no experts were given"
 AT_MOMENTS = "evaluate exactly where Curriculum.moments says"
 MOST_MOMENTS = 5
-"""Most moments that a reason names."""
 
 
 def scores(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None = None) -> dict[str, Metric]:
@@ -150,7 +149,6 @@ OF_GRAPHS = (
     *(f"{policy}_entropies" for policy in POLICIES),
     *("random_frames", "search_episodes"),
 )
-"""Inputs of CT-graphs only."""
 
 
 def _measured(
@@ -184,11 +182,9 @@ OF_TRAINING = (
     *("episodes", "returns", "labelling", "interval_best"),
     *("first_frames", "first_episodes", "first_success_rates"),
 )
-"""Inputs by training intervals."""
 
 
 def _training(log: RunLog, curriculum: Curriculum, best: Tensor | Undefined, last: int) -> NamedValues:
-    """Return the inputs by training intervals, which must reach ``last`` frames."""
     reached = max((m["frames"] for m in log.of_kind("training")), default=0)
     if 0 < reached < last:
         reason = Undefined(f"training is logged up to {reached:,} of {last:,} frames: log it to the end")
@@ -256,7 +252,6 @@ def lowest_returns(tasks: Sequence[TaskLike]) -> Tensor | Undefined:
 
 
 def _said_by(tasks: Sequence[TaskLike], member: str, value: Callable[[Any], float]) -> Tensor | Undefined:
-    """Return an optional member's value of each task, or why one does not know it."""
     if not hasattr(type(tasks[0]), member):
         return Undefined(f"{_kind(tasks)} has no {member}, so it is not known")
     return _of_each(value, tasks)
@@ -314,7 +309,6 @@ def _have_noise(tasks: Sequence[TaskLike]) -> Tensor:
 
 
 def _mastery_curves(log: RunLog, curriculum: Curriculum, returns: Curves) -> Curves:
-    """Return the curves, with shares of episodes at the goal for tasks with noisy rewards."""
     have_noise = _have_noise(curriculum.tasks)
     shares = log.curves(curriculum.trained, "success_rate").performance
     return replace(returns, performance=torch.where(have_noise, shares, returns.performance))
@@ -328,7 +322,6 @@ def _known(value: Callable[[Task, float], float], task: Task) -> float:
 
 
 def _interval_best(log: RunLog, curriculum: Curriculum, best: Tensor | Undefined) -> Tensor | Undefined:
-    """Return the optimum of each interval's last block; NaN where its tasks differ."""
     if isinstance(best, Undefined):
         return best
     alone = []
@@ -357,7 +350,6 @@ def _labelling(log: RunLog, curriculum: Curriculum) -> Labelling | Undefined:
 
 
 def _first_blocks(log: RunLog, curriculum: Curriculum) -> NamedValues:
-    """Return each task's intervals in its first block, which must train no other."""
     blocks = curriculum.trained
     firsts: dict[int, int] = {}
     for number, block in enumerate(blocks):

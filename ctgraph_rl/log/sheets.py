@@ -13,7 +13,6 @@ from rich.text import Text
 from ctgraph_rl.log.escape import latex_text, markdown_text, terminal_text
 
 LISTED = {"name": "l", "version": "r", "tasks": "r", "frames": "r", "fingerprint": "l", "source": "l"}
-"""Columns of a list of curricula."""
 
 MATHS = {
     "P_R": "$P_R$",
@@ -26,11 +25,9 @@ MATHS = {
     "p": "$p$",
 }
 WIDE = 60
-"""Characters from which on LaTeX breaks a column into lines."""
 
 
 WIDTH = 100
-"""Characters of a line without a terminal."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +94,6 @@ def to_latex(sheet: Sheet) -> str:
 
 
 FORMATS: dict[str, Callable[[Sheet], str]] = {"markdown": to_markdown, "latex": to_latex}
-"""Makers of texts by format; ``text`` is the terminal's."""
 
 
 def with_numbers(sheet: Sheet) -> Sheet:

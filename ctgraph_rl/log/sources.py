@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 OURS = ("ctgraph_rl", "baselines", "curricula", "hydra_plugins")
-"""Packages that the numbers version covers."""
 
 RECORDED = ("torch", "torchrl", "tensordict", "hydra")
 """Installed packages whose versions every run stores anyway."""
@@ -33,7 +32,6 @@ STANDARD = tuple(sysconfig.get_path(name) for name in ("stdlib", "platstdlib"))
 SCRIPT = "__main__"
 
 SCRIPTS = (SCRIPT, "__mp_main__")
-"""The script, and its name in processes of ``multiprocessing``."""
 
 
 class Module(NamedTuple):
@@ -76,7 +74,6 @@ def find_sources(names: Iterable[str]) -> dict[str, str | None]:
 
 
 def _specs(name: str) -> Iterator[tuple[str, ModuleSpec]]:
-    """Yield the packages and the module at the beginning of a dotted name, without importing."""
     package, *rest = name.split(".")
     if package in OURS:
         return
@@ -153,7 +150,6 @@ def read_module(name: str, source: bytes, is_package: bool = False) -> Module:
 
 
 def _of_script(name: str) -> Module | None:
-    """Return what a class or function of the script needs of it; None without a defining file."""
     path = getattr(sys.modules.get(SCRIPT), "__file__", None)
     if path is None or not Path(path).is_file():
         return None
@@ -182,7 +178,6 @@ DEFINITIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
 
 
 def _defined(statement: ast.stmt) -> Iterator[str]:
-    """Yield the names that a statement defines, or whose attribute or item it sets."""
     if isinstance(statement, DEFINITIONS):
         yield statement.name
         return

@@ -18,7 +18,6 @@ from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG, METRICS, MOST_BYTES_OF_
 from ctgraph_rl.strict import json_value
 
 FILES = "files"
-"""Key of the sums beside the metrics."""
 
 RESULTS = (LOG, CURRICULUM, AGENT, METRICS)
 """Files of a run, in the order of writing; ``curriculum.json`` only for parts of this package's classes."""

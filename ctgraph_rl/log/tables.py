@@ -49,7 +49,6 @@ EVALUATIONS = {
     **EPISODES,
     **SECONDS,
 }
-"""Columns: type and meaning."""
 
 TRAINING = {
     **RUN,
@@ -146,7 +145,6 @@ def require_parquet() -> None:
 
 
 def _types(kind: str, columns: dict[str, tuple[str, str]], *logs: RunLog) -> dict[str, str]:
-    """Type of each column; the logs' other fields follow as numbers, by first appearance."""
     types = {name: type_ for name, (type_, _) in columns.items()}
     for log in logs:
         names = dict.fromkeys(chain(*log.of_kind(kind)))

@@ -22,16 +22,13 @@ from ctgraph_rl.metrics.regimes import Column, Regime, RegimeTable
 from ctgraph_rl.metrics.transfer import check_experts, mean_area, stage_areas, trapezoid_area
 
 SUMMARY = (average_performance, forward_transfer, backward_transfer, forgetting)
-"""The metrics that every run shows."""
 
 ORDER = ("matrix", "curves", "optimum", "ceilings", "lifetime", "transfer")
-"""Modules as listed; other modules follow."""
 
 for _found in iter_modules(__path__):
     import_module(f"{__name__}.{_found.name}")
 
 NamedMetrics = dict[str, Metric]
-"""Metrics by name."""
 
 
 def of_inputs(given: Mapping[str, Any]) -> NamedMetrics:
@@ -89,7 +86,6 @@ def definitions() -> dict[str, Definition]:
 
 
 AGAINST_EXPERTS = tuple(entry.metric for entry in METRICS.values() if "experts" in entry.required)
-"""Lifelong metrics relative to experts."""
 
 
 def __getattr__(name: str) -> Callable[..., Metric]:

@@ -20,10 +20,8 @@ from ctgraph_rl.metrics.record import HERE, Undefined, defined, float64
 HUBERT = "Hubert & Arabie 1985, Comparing partitions (Journal of Classification 2)"
 
 SEVERAL = -1
-"""The task of an interval that has several."""
 
 PER = 100_000
-"""Frames per which alarms are counted."""
 
 
 class Labelling(NamedTuple):

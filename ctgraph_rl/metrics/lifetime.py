@@ -41,7 +41,6 @@ UNSATURATED_SHARE = 0.2
 """Share of an expert's saturation below which sample efficiency is 0."""
 
 ROUNDING = 1e-12
-"""Relative difference below which two values are equal."""
 
 
 Regimes = Sequence[Regime]
@@ -291,13 +290,11 @@ def theil_sen(values: Sequence[float]) -> float:
 
 
 def _first_at_least(values: Tensor, level: float) -> int:
-    """Position of the first value that reaches a level, but for rounding; one more than all if none does."""
     reached = (values >= level - ROUNDING * abs(level)).nonzero()
     return int(reached[0]) if len(reached) else len(values) + 1
 
 
 def _maintenance(table: RegimeTable, to_evaluation: bool) -> Tensor:
-    """Mean change of a task's evaluations against the references among them."""
     training = table.training.tolist()
     terminal = table.terminal.tolist()
     last: list[float | None] = [None] * len(table.names)
@@ -371,7 +368,6 @@ def _joined(table: RegimeTable, places: Sequence[int]) -> Tensor:
 
 
 def _against(table: RegimeTable, experts: Experts, value: Callable[[Sequence[Tensor], list[int]], float]) -> Tensor:
-    """A value for each trained task, by first appearance; NaN for one without experts."""
     values = []
     for task, own in zip(table.names, table.places(training=True), strict=True):
         if own:

@@ -17,13 +17,11 @@ from ctgraph_rl.metrics.bounds import BoundsOf, unbounded
 from ctgraph_rl.metrics.inputs import INPUTS
 
 HERE = "ctgraph_rl"
-"""Source of definitions of this package."""
 
 MASTERED = 0.9
 """Share of episodes, or of the optimal value, that counts as mastered."""
 
 TENSORS = ("Tensor", "Tensor | None", Tensor, Tensor | None)
-"""Annotations of tensors, also as text."""
 
 Arguments = ParamSpec("Arguments")
 
@@ -77,9 +75,7 @@ class Entry(NamedTuple):
     inputs: dict[str, str]
     """Names in `INPUTS` by argument."""
     required: tuple[str, ...]
-    """Inputs without which there is no metric."""
     bounds: BoundsOf = unbounded
-    """Lowest and highest value of a run."""
     is_time: bool = False
     """Whether it is a time, infinite in a run that never got there."""
     is_exact: bool = False
@@ -93,7 +89,6 @@ class Entry(NamedTuple):
 
 
 METRICS: dict[str, Entry] = {}
-"""Every metric by its function's name."""
 
 
 class Undefined(Exception):

@@ -25,7 +25,6 @@ from ctgraph_rl.metrics.bounds import (
 from ctgraph_rl.metrics.record import HERE, MASTERED, METRICS, Undefined, defined, ratio
 
 NUM_WINDOWS = 10
-"""Of a life, as equal as possible; fewer in a shorter life."""
 
 JUMP_START = "Taylor & Stone 2009, JMLR 10: jumpstart"
 
@@ -243,4 +242,3 @@ def frame_regret(life: LifeCurves) -> Tensor:
 
 
 OF_LIFE = tuple(name for name, entry in METRICS.items() if entry.required == ("life",))
-"""All metrics of lives, by name."""

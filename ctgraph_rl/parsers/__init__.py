@@ -26,14 +26,11 @@ CHANGES: dict[str, type] = {
     "read_noise": int,
     "read_rotation": int,
 }
-"""Arguments of `ctgraph_rl.tasks.configurations.make_task` that are plain numbers."""
 
 DPI = 160
-"""Pixels an inch of a figure."""
 
 EXPORT_FORMATS = ("l2logger", "parquet", "csv")
 LEVELS = ("rescored", "rerun", "held_out")
-"""How far a submission is verified."""
 
 LIMIT_TIMES = 5
 """The time limit of a process of a verification, as a multiple of what the submitted run took."""

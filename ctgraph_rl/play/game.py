@@ -32,12 +32,10 @@ from ctgraph_rl.tasks.images import white_level
 from ctgraph_rl.tasks.task import Task
 
 SHADES = " .:-=+*#%@"
-"""From black to white, without colours."""
 WIDTH = 24
 """Least columns of an image; pixels of a small one are repeated."""
 VECTOR_COLUMNS = 16
 MOST_BRANCHES = 16
-"""Most end states for which the whole tree is shown."""
 MOST_KEYS = 9
 """Largest action that one key names; others are typed as lines."""
 END_OF_INPUT = "\x04"

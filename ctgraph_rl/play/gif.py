@@ -12,7 +12,6 @@ from ctgraph_rl.disk import write_named
 from ctgraph_rl.play.player import Player
 
 LAST = 3
-"""Duration of the last picture, in durations of the others."""
 
 
 def save_gif(player: Player, path: Path | str, seconds: float = 0.6, size: int = 192, most_frames: int = 200) -> None:

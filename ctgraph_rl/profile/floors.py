@@ -13,10 +13,8 @@ from ctgraph_rl.tasks.task import Task
 from ctgraph_rl.tasks.values import memoryless_ceiling, open_loop_ceiling, random_frames_to_goal
 
 NEGLIGIBLE = 1e-9
-"""Probability of long episodes that do not count."""
 
 STARTS = 20
-"""Sequences of decisions from which the best is sought."""
 
 
 def best_without_memory(task: Task) -> float:

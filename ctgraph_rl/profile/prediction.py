@@ -25,16 +25,12 @@ from ctgraph_rl.runs.load import load
 from ctgraph_rl.tasks.task import Task
 
 NUM_EPISODES = 256
-"""Of each policy."""
 
 MOST_STEPS = 64
-"""Of an episode; longer ones are cut."""
 
 SEED = 230210887
-"""Of the held-out episodes, the same for all agents."""
 
 TOLERANCE = 1e-3
-"""Largest distance from 1 of a row's probabilities."""
 
 
 MOST_LETTERS = 300

@@ -172,7 +172,6 @@ def _parts(values: Sequence[Any], sizes: Sequence[int]) -> list[Sequence[Any]]:
 MEASURES: Mapping[str, Callable[..., Measured]] = by_name(
     above_ceilings, above_random_search, faster_than_random_search, gains, held_out, searches, predicts
 )
-"""The measures by name, for a table of properties."""
 
 
 def measure(run: Evidence, controls: Sequence[Evidence], prop: Any) -> Measured:

@@ -30,7 +30,6 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 LEVEL = 0.95
 
 HALVINGS = 20
-"""Of [0, 1], to find an end of an interval."""
 
 
 REPLACED = ("curriculum=", "seed=", "overwrite=")
@@ -212,7 +211,6 @@ def profile_results(paths: Sequence[Path | str], agents: Sequence[str] = ()) -> 
 
 
 RunsByName = dict[str, dict[int, Run]]
-"""The runs of an agent by curriculum and seed."""
 
 
 def _results(

@@ -130,7 +130,6 @@ def _around(bounds: Sequence[Bounds]) -> Bounds:
 
 
 def _shares(tasks: Sequence[TaskLike], returns: Sequence[Bounds]) -> Bounds:
-    """Return the bounds of any task's (return - failure) / (optimum - failure); infinite where unknown."""
     failures = lowest_returns(tasks)
     optima = optimal_values(tasks)
     if isinstance(failures, Undefined) or isinstance(optima, Undefined):

@@ -23,7 +23,6 @@ WHERE_KNOWN = (
     *(metric.__name__ for metric in metrics.AGAINST_EXPERTS),
     *("continual_world_forward_transfer", "forward_transfer_from_experts", "memory_gap_closed"),
 )
-"""Metrics that are shown where some run of a curriculum has a value."""
 
 
 def columns(trained: Trained, adapts: bool, is_life: bool = False) -> tuple[str, ...]:

@@ -18,12 +18,10 @@ NO_RUN_FINISHED = "every_metric"
 """The measure of an agent's only row if none of its runs finished."""
 
 Modified = Mapping[str, str]
-"""What differs from the published curriculum, by the name of a modified one."""
 
 NOT_MODIFIED: Modified = {}
 
 WIDTH = 80
-"""Characters of a line on a terminal."""
 
 MEANS = "mean [95 % CI]"
 CI = "95 of 100 such intervals (CI) hold the true value"

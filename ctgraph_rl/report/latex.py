@@ -20,7 +20,6 @@ LINE_WIDTH = 345.0
 """Points of a line of ``article`` in letters of 10 points."""
 
 COLUMN_SEPARATION = 8.0
-"""Points between two columns."""
 
 LETTER = 5.2
 """Points of a letter in a name of 8 points; a digit has 4.3."""
@@ -29,7 +28,6 @@ COLUMN = 58.0
 """Points of a column of numbers: its broken heading, and an interval such as [-0.84, 0.84]."""
 
 HEADING = 12
-"""Characters of a heading's line."""
 
 MOST_LINES = 40
 
@@ -52,7 +50,6 @@ def as_cell(text: str, note: int = 0) -> TableCell:
 
 
 TableRows = Sequence[tuple[str, Sequence[TableCell]]]
-"""Rows with their names."""
 
 
 class Table(NamedTuple):

@@ -14,7 +14,6 @@ NOT_COMPARED = ("name", "source", "fingerprint", "schema", "about")
 """Keys of a curriculum's JSON that do not change what is learned."""
 
 MOST_CHANGES, MOST_VALUES = 6, 3
-"""Most changes that are named, and most values of one."""
 
 
 def modifications(runs: Sequence[Run]) -> dict[str, str]:
@@ -47,7 +46,6 @@ def modification(run: Run) -> str:
 
 
 def _collect(value: Any, key: str, found: dict[str, list[Any]]) -> None:
-    """Add values of nested JSON by dotted names, such as ``blocks.num_frames``, without places in lists."""
     if isinstance(value, Mapping):
         for name, inner in value.items():
             if key or name not in NOT_COMPARED:

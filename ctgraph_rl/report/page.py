@@ -42,16 +42,13 @@ OF_AGENT: tuple[Callable[[Section, Result, Trees], CaptionedFigure | None], ...]
 """Figures of an agent with finished runs, in order; None for nothing to draw."""
 
 MOST_ROWS = 2000
-"""Rows up to which the table of every measure is shown."""
 
 MOST_SENTENCES = 10
 
 MOST_COLUMNS = 10
-"""Tasks up to which LaTeX has the performance matrix."""
 
 
 TextRow = tuple[str, ...]
-"""The cells of a row of a table."""
 
 
 class Report(NamedTuple):

@@ -54,7 +54,6 @@ AT_END = {
         _HERE,
     ),
 }
-"""Measures of how tasks ended, by the first word of their name."""
 
 HEADER = (
     *("curriculum", "agent", "measure", "value", "low", "high", "n", "n_undefined", "method", "definition", "note"),
@@ -97,7 +96,6 @@ class Row:
 
 
 MeasureLine = tuple[str, Estimate, str, str]
-"""Measure, estimate, definition and note."""
 
 
 def table(runs: Sequence[Run], statistics: str = "exact", count: Count = silent) -> list[Row]:

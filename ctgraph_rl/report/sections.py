@@ -25,7 +25,6 @@ from ctgraph_rl.report.statistics import Estimate, mean
 from ctgraph_rl.runs.read import BySeed, Curve, History, Run, grouped, histories, present, split_by
 
 Estimates = list[list[Estimate]]
-"""Estimates over seeds, [blocks][tasks]."""
 
 
 FEWEST_FOR_BANDS = 10

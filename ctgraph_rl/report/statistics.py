@@ -33,16 +33,12 @@ RESAMPLES = 10_000
 BATCH = 1000
 
 MOST_FLIPPED = 16
-"""Pairs up to which all flips of signs are tried."""
 
 ROUNDING = 1e-12
-"""Sums that differ by less are equal."""
 
 EQUAL_SEEDS = "all seeds are equal; few seeds leave other means possible, and the interval shows which"
-"""Why an interval has a width though all seeds are equal."""
 
 MOST_SEEDS = 2**20
-"""Seeds at which `seeds_needed` gives up."""
 
 
 Values = Sequence[float | None]
@@ -448,7 +444,6 @@ def _checked(bounds: LowHigh) -> Bounds:
 
 
 def _sign_flip(differences: Sequence[float]) -> float:
-    """Return the two-sided p-value of the sum under all flips of signs, or many random ones."""
     count = len(differences)
     if count <= MOST_FLIPPED:
         signs = np.array(list(product((1, -1), repeat=count)))
@@ -460,7 +455,6 @@ def _sign_flip(differences: Sequence[float]) -> float:
 
 
 def _middle_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the mean of the middle half of weighted values, for each row of weights with sum 1."""
     order = np.argsort(values)
     below = np.clip(np.cumsum(weights[:, order], axis=1), 0.25, 0.75)
     parts = np.diff(below, axis=1, prepend=0.25)

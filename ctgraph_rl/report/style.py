@@ -18,7 +18,6 @@ from ctgraph_rl.packages import OF_REPORT
 STYLE = Path(__file__).with_name("style.mplstyle")
 
 WIDTH = 7.2
-"""Inches of a page's text in print."""
 
 WIDTHS = {"text": WIDTH, "column": 3.5}
 """Inches of a figure: a page's text, or one of its two columns."""

@@ -36,22 +36,17 @@ IN_WINDOWS = (
     *("window_return", "window_regret", "window_solved", "jump_start"),
     *("adaptation_frames", "never_adapted"),
 )
-"""Metrics whose terms are shown for each window of a stream."""
 
 LONGEST_LABEL = 24
-"""Characters of a task's label in a table; a longer one loses its middle."""
 
 BARS, ASCII_BARS = "▁▂▃▄▅▆▇█", "_.-:=+*#"
-"""Heights of a curve's points, from lowest to highest."""
 
 MOST_POINTS = 32
 """Characters of a curve; more evaluations share them."""
 
 FEWEST_POINTS = 5
-"""Least characters of a curve."""
 
 WIDEST = 10**6
-"""Characters of a terminal on which everything fits."""
 
 
 def print_summary(run_dir: Path | str, console: Console | None = None) -> None:
@@ -123,10 +118,6 @@ def sparklines(evaluations: Mapping[str, Curve], bars: str = BARS, most: int = M
 
 
 def _tasks(name: str, history: History, curves: Mapping[str, str]) -> Table:
-    """Return a line for each task: its return before training, its best one after a block, its last one, and its curve.
-
-    A best of 0 or less has no block.
-    """
     where = f"ctgraph-rl export has it after each of {len(history.ends) - 1} blocks"
     table = Table(title=_text(f"{name}: mean return on each task; {where}"))
     for heading in ("task", "before", "best", "in block", "at end"):

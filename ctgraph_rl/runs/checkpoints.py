@@ -25,13 +25,10 @@ from ctgraph_rl.log.sums import sum_of
 from ctgraph_rl.runs.interrupt import Interrupt
 
 FORMAT = 1
-"""Rises when the meaning of a checkpoint changes."""
 
 KEPT = 2
-"""Newest checkpoints that stay."""
 
 SECONDS = 300.0
-"""Default time between checkpoints within a block."""
 
 RunState = Mapping[str, Any]
 """Tensors and plain Python values, nested; ``frames`` is the run's frames so far."""

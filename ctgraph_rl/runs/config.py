@@ -50,7 +50,6 @@ if TYPE_CHECKING:
     from ctgraph_rl.tasks.curriculum import Curriculum
 
 IS_NEXT_HYDRA = hasattr(hydra.utils, "execution_whitelist")
-"""Whether it is Hydra 1.4 or later, with OmegaConf 2.4 or later."""
 
 PARTS = {"evaluation": "every=5120", "protocol": "task_id=one_hot"}
 """The groups that change a curriculum, each with an example."""
@@ -58,7 +57,6 @@ PARTS = {"evaluation": "every=5120", "protocol": "task_id=one_hot"}
 RESUME = ("warn", "strict")
 
 STALE = "stale"
-"""Of ``overwrite``: run again only what was run with other code."""
 
 RENEWED: tuple[type, ...] = (GlobalHydra, JobRuntime, VersionBase)  # of Hydra's state: what composing changes
 _HYDRA = threading.RLock()  # is held while Hydra's global state is ours
@@ -71,7 +69,6 @@ NOT_HASHED = (
     *("overwrite", "experts_dir", "resume", "checkpoint_seconds"),
     *("logger", "objective", "report", "together", "seeds", "track"),
 )
-"""Keys that do not change results."""
 
 
 def of_hydra(function: Function) -> Function:

@@ -28,13 +28,11 @@ from ctgraph_rl.tasks.kinds.task_like import TaskLike
 from ctgraph_rl.tasks.protocol import Block, Protocol
 
 RunDirs = Mapping[int, Path]
-"""The directory of each seed."""
 
 Learn = Callable[[Curriculum, RunDirs, Session], Failures]
 """Lets seeds learn a curriculum as one batch, or resume, each into its locked directory."""
 
 EXPERT = "single-task expert"
-"""The name of experts' curricula."""
 
 
 class Expert(NamedTuple):

@@ -42,13 +42,10 @@ SAID = (
     ),
     (re.compile(r"Multiple values for (\S+)\. To override .*'override \S+: (.*)'"), "{0} has a value: write {0}={1}"),
 )
-"""Beginnings of Hydra's messages, and their replacements."""
 
 MOST_CHOICES = 20
-"""Names that a message lists at most."""
 
 LAUNCHERS = {"hydra/launcher/joblib": "joblib", "hydra/launcher/submitit_slurm": "slurm"}
-"""Configurations of other packages, and their extras."""
 
 _NO_SETTINGS = {"_target_", "hydra"}
 
@@ -92,12 +89,6 @@ def _first(error: OmegaConfBaseException) -> OmegaConfBaseException:
 
 
 def _of_omegaconf(error: OmegaConfBaseException, message: str) -> str:
-    """Return a setting's fault: its name, its value as typed, why, and what to do.
-
-    Args:
-        error: by OmegaConf.
-        message: for errors that name no setting.
-    """
     key = str(error.full_key or "")
     if not isinstance(error.parent_node, DictConfig) or not key:
         return message
@@ -139,7 +130,6 @@ def _unknown_file(group: str, name: str, choices: Sequence[str]) -> str:
 
 
 def _unknown_setting(asked: str, node: DictConfig) -> str:
-    """Return why a setting is unknown, and the likely one: beside it or, of the whole run, anywhere below."""
     group, _, key = asked.rpartition(".")
     if group == "hydra.runtime.choices" and len(node):
         return _removed(key)

@@ -98,11 +98,6 @@ def _deaf() -> Iterator[None]:
 
 
 def _put_into_queue(requeue: Callable[[int, FrameType | None], object]) -> None:
-    """Call submitit's handler, which leaves the process.
-
-    Raises:
-        RuntimeError: if that failed and the job is not in SLURM's queue.
-    """
     try:
         requeue(_requeuing(), None)
     except (OSError, subprocess.SubprocessError) as error:

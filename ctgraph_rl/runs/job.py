@@ -53,13 +53,10 @@ from ctgraph_rl.tasks.curriculum import Curriculum, Stream
 from ctgraph_rl.tasks.protocol import changed
 
 OF_AN_EXPERT = ("agent", "seed", "device", "num_threads", "portable")
-"""Settings that an expert shares with its run."""
 FEW = 5
-"""Most settings that a refusal names."""
 
 
 ConfigAndPath = tuple[Any, Path]
-"""A composed configuration, and its run's existing directory."""
 
 
 class Recipe(NamedTuple):

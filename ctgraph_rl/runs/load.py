@@ -155,7 +155,6 @@ def _with(run_dir: Path, make: Any, stored: Any) -> Callable[..., Any]:
 
 
 def _ours(run_dir: Path, part: str, settings: Any) -> Callable[..., Any]:
-    """Return what builds a configuration's part, such as its agent, if its class is one of ``baselines``."""
     settings = settings if isinstance(settings, Mapping) else {}
     name = str(settings.get("_target_"))
     ours = OURS[part].fullmatch(name)

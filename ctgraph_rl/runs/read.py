@@ -34,13 +34,10 @@ from ctgraph_rl.runs.status import failure
 from ctgraph_rl.strict import files_below, one_line_of, too_deep
 
 MODIFIED = " (modified)"
-"""Ending of the name of a curriculum that differs from the published one."""
 
 OF_THE_CURRICULUM = ("curriculum", "evaluation", "protocol")
-"""Settings within the fingerprint."""
 
 ABOUT = ("curriculum", "fingerprint", "config")
-"""Keys of a log's first line."""
 
 NO_METHOD = "Finetune"
 """The method that changes nothing, as none."""
@@ -53,19 +50,15 @@ MEASURES = {
     "adaptation": ("adaptation_", ("return_mean", "success_rate", "found_rate", "exact_rate")),
     "training": ("training_", ("return_mean", "success_rate")),
 }
-"""By kind of measurement: the beginning of values' names, and the fields."""
 
 MOST_SEEDS = 10
-"""Seeds of a configuration that a sentence names."""
 
 MOST_MODULES = 3
 """Differing modules that are named; one digest stands for the others."""
 
 CurriculumKey = tuple[str, str]
-"""A curriculum's name and fingerprint."""
 
 AgentKey = tuple[str, str]
-"""Curriculum and agent, as tables name them."""
 
 Curve = list[tuple[int, float]]
 """Mean returns by frames, or NaN."""
@@ -85,11 +78,9 @@ class Value(NamedTuple):
 
 
 NOWHERE = (None,) * 6
-"""Place of a whole run's numbers."""
 
 
 UNIT_METRICS = {"dead": "dead units", "dormant_0.1": "dormant units (0.1)", "rank_effective": "effective rank"}
-"""Metrics of hidden units in figures, with their names."""
 
 
 class History(NamedTuple):
@@ -486,12 +477,10 @@ def _place(run: Run | None) -> float:
 
 
 def _rank(value: Any) -> tuple[int, float, str]:
-    """Orders a setting's values: none, numbers by size, then others by text."""
     return (1, value, "") if is_real(value) else (0 if value is None else 2, 0.0, str(value))
 
 
 def _agent_names(runs: Sequence[Run]) -> list[str]:
-    """Each run's agent, with the settings in which it differs on the curriculum."""
     differing = {kind: _differing(some) for kind, some in split_by(runs, _kind).items()}
     twins = split_by(runs, lambda run: run.alike)
     names = []

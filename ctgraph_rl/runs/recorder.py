@@ -206,7 +206,6 @@ class Recorder:
         self._member.begin(state)
 
     def _check_same(self, begun: Mapping[str, Any]) -> None:
-        """Refuse to resume a run of another curriculum or other settings; `begin` checks code."""
         before = begun.get("fingerprint")
         now = self.curriculum.fingerprint
         other = f"{self.run_dir} holds a run of {begun.get('curriculum')} (fingerprint {before}), this one has {now}"
@@ -357,7 +356,6 @@ class Recorder:
                 self._member.finish()
 
     def _open_rule(self) -> Rule:
-        """Return the rule that this is open: else another writer may be in its directory."""
         is_open = self.run_dir is None or self.finished or self._session is not None
         return is_open, f"this Recorder of {self.run_dir} is closed: a Recorder with resume=True resumes its run"
 

@@ -55,7 +55,6 @@ RESTARTS = "restarts.jsonl"
 """Where a stopped run was resumed, and on which machine."""
 
 Failures = dict[int, FloatingPointError]
-"""Errors by position in a session, or by seed."""
 
 Opened = TypeVar("Opened")
 
@@ -123,7 +122,6 @@ class RunMember(Member):
             print(f"note: {said}: {terminal_text(error)}")
 
     def _check_unchanged(self, about: ReadOnlyValues) -> None:
-        """Refuse to resume by other code; warn of another machine or versions, or refuse if ``strict``."""
         run_dir = self.run_dir
         before = RunLog.begun(run_dir / LOG) or {}
         lost = f"{run_dir} has checkpoints, but no {LOG} of a run: restore it, or start with overwrite=true"

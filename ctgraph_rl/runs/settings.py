@@ -20,7 +20,6 @@ SPECS = ("observation_spec", "action_spec", "folder")
 """Arguments that a run gives: environments' specs to agents, folders to trackers."""
 
 HINTS = {"cell": "it has no memory; use agent=lstm_ppo, rl2, drqn or qrdqn_lstm, or leave the cell out"}
-"""What to do about settings that only some targets take."""
 
 LSTM = {
     "_target_": "baselines.cells.lstm.LSTM",
@@ -119,7 +118,6 @@ def as_before(settings: ReadOnlyValues) -> NamedValues:
 
 
 def _without(settings: ReadOnlyValues, added: ReadOnlyValues, prefix: str = "") -> NamedValues:
-    """Return nested settings without added ones of this value, and without groups left empty."""
     kept: NamedValues = {}
     for key, value in settings.items():
         name = f"{prefix}{key}"

@@ -40,10 +40,8 @@ MISSING = "missing"
 START_AGAIN = "overwrite=stale runs what is stale again, overwrite=true all"
 
 SHOWN = 20
-"""Cells in the final report."""
 
 SECONDS_BETWEEN_LINES = 60.0
-"""Without a terminal."""
 
 
 class Status(NamedTuple):

@@ -49,10 +49,8 @@ else:
     Base = object  # Hydra may load its plugins again: `hydra_plugins`, which it loads then too, names the present class
 
 Overrides = Sequence[str]
-"""The settings of one cell, as on the command line."""
 
 ALL_CORES = -1
-"""joblib's number of processes."""
 
 SUBDIR = "${run_name:}"
 """Names a directory after the configuration, so that a cell is found before it runs."""
@@ -239,7 +237,6 @@ class Sweeper(Base):
             raise ValueError(f"{cell}{explain(error)}") from error
 
     def _compare(self, cfg: DictConfig, folder: Path) -> None:
-        """Keep in words what code has changed since a cell was run, or that this is unknown."""
         if not holds_results(folder):
             return
         check_packages()
@@ -365,7 +362,6 @@ def sweepable(arguments: Sequence[str]) -> list[str]:
 
 
 def _as_choice(key: str, value: str) -> str:
-    """Return a setting as the choice of its one value; unchanged, if it has several, or would be read differently."""
     setting = f"{key}={value}"
     choice = f"{key}=choice({value})"
     parse = OverridesParser.create().parse_override

@@ -27,10 +27,8 @@ from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.runs import config
 
 FOLDER = "tracker"
-"""Trackers' folder in the run's directory."""
 
 MODES = ("offline", "online")
-"""Of W&B."""
 
 ENVIRONMENT = {
     "WANDB_ERROR_REPORTING": "false",

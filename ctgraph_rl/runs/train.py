@@ -37,13 +37,11 @@ MakeAgent = Callable[[Composite, TensorSpec], Agent]
 """Builds an agent of unbatched observation and action specs."""
 
 MakePlasticity = Callable[[], PlasticityLike]
-"""Builds a plasticity."""
 
 MEMBERS = (
     *("num_envs", "num_steps", "policy", "policy_for", "initial_state"),
     *("start_task", "end_task", "learn", "to", "state_dict"),
 )
-"""What a run needs of an agent."""
 
 
 def new_agent(curriculum: Curriculum, make_agent: MakeAgent, seed: int, device: torch.device | str = "cpu") -> Agent:

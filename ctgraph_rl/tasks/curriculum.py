@@ -32,10 +32,8 @@ from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
 from ctgraph_rl.tasks.task import Task, are_graphs
 
 FINGERPRINT_SCHEMA = 1
-"""Raised when the way a fingerprint is computed changes."""
 
 SHOWN = 20
-"""Most blocks, and tasks of a block, in a notebook."""
 
 
 @dataclass(frozen=True)
@@ -389,7 +387,6 @@ def _some(names: Sequence[str], between: str = ", ") -> str:
 
 
 def _canonical(value: Any) -> Any:
-    """A value as plain JSON: dataclasses by name, with compared fields that differ from their defaults."""
     if is_dataclass(value) and not isinstance(value, type):
         found = {"type": type_name(type(value))}
         for field_ in fields(value):

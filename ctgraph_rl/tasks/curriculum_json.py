@@ -42,16 +42,12 @@ if TYPE_CHECKING:
     from ctgraph_rl.tasks.curriculum import Curriculum
 
 SCHEMA = 1
-"""Raised when the form of the JSON changes."""
 
 MAX_BYTES = 2**26
-"""Largest file that is read: 64 MiB."""
 
 MAX_NESTING = 16
-"""Most objects and lists within each other; a curriculum has 5."""
 
 MAX_BANK_BYTES = 2**36
-"""Most that the images of one task may need: 64 GiB."""
 
 _GRAPH_FACTS = (
     "num_states",
@@ -195,7 +191,6 @@ def _text(value: Any, margin: str = "\n") -> str:
 
 
 def _check_form(value: Any, nesting: int = 1) -> None:
-    """Refuse what is not JSON, nested too deeply, or beyond numbers of 64 bits."""
     if isinstance(value, (Mapping, list)):
         require((nesting <= MAX_NESTING, f"nested more than {MAX_NESTING} deep"))
         for key, item in value.items() if isinstance(value, Mapping) else enumerate(value):

@@ -11,7 +11,6 @@ from ctgraph_rl.tasks.task import Task
 from ctgraph_rl.tasks.values import memoryless_ceiling, optimal_value, policy_measures
 
 BISECTIONS = 80
-"""Halvings of the interval in which the largest gain lies; float64 has 53 bits."""
 
 
 def optimal_gain(task: Task, pause: int = 0) -> float:
@@ -85,6 +84,5 @@ def lost_by_policies(task: Task, num_frames: int) -> dict[str, Lost]:
 
 
 def _failed_searches(num_goals: int, num_episodes: float) -> float:
-    """Return the mean number of episodes that end elsewhere: episode i does with probability 1 - i / n."""
     tried = min(num_episodes, num_goals)
     return tried - tried * (tried + 1) / (2 * num_goals)

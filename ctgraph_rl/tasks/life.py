@@ -19,10 +19,8 @@ Made = TypeVar("Made")
 ORDERS = ("similar", "dissimilar", "returning", "drifting", "conflicting")
 
 IMAGE_SEEDS = 2**40
-"""New image sets have a seed below this."""
 
 KEPT = 256
-"""Tasks that are kept after they were made."""
 
 
 class Lazy(Sequence[Made]):

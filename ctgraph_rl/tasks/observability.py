@@ -16,13 +16,10 @@ from ctgraph_rl.core.rewards import Needle
 from ctgraph_rl.tasks.task import Task
 
 POLICIES = ("random", "navigation", "optimal")
-"""The policies of section 2.2 of the paper."""
 
 PLACED = (StateType.WAIT, StateType.DECISION, StateType.END)
-"""Kinds with possibly several states."""
 
 VisitsByLevel = dict[StateType, dict[int, float]]
-"""Expected visits by kind and level."""
 
 
 def states_per_observation(task: Task) -> dict[str, int]:
@@ -119,7 +116,6 @@ def transition_entropy(task: Task, policy: str = "navigation", informed: bool = 
 
 
 def _drawn_bits(task: Task, kind: StateType) -> float:
-    """log2 of the ids that a state draws from."""
     if task.observations.is_unique(kind):
         return 0.0
     first, last = task.observations.ids(kind)
@@ -154,7 +150,6 @@ def _chances(graph: CTGraph, policy: str) -> tuple[float, float]:
 
 
 def _branches(graph: CTGraph, policy: str) -> int:
-    """How many branches a policy takes at a decision state, equally often."""
     return 1 if policy == "optimal" else graph.branching_factor
 
 

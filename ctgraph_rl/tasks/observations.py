@@ -13,7 +13,6 @@ from ctgraph_rl.checks import Rule, as_tuple, is_int, make_fields_plain, require
 from ctgraph_rl.core.graph import CTGraph, StateType
 
 Ids = tuple[int, int]
-"""First and last id, both included."""
 
 MAX_READ_ROTATION = 359
 

@@ -64,14 +64,12 @@ _KEYS: dict[str, tuple[str, str | None, str | None, str | None]] = {  # section,
 """By key of a dialect: what it means here, and its name in each dialect; None where it has none."""
 
 MAX_BYTES = 2**20
-"""Largest file read, 1 MiB."""
 
 _SECTIONS = tuple(dict.fromkeys(section for section, *_ in _KEYS.values()))
 
 _DISTRIBUTIONS: dict[str, RewardFn] = {"needle_in_haystack": Needle(), "linear": ReferenceLinear()}
 
 _LEGACY: NamedValues = {"reward_cue": True, "cue_wraps": True, "legacy_index": True, "noise_before_rotation": True}
-"""How the authors' implementation shows states."""
 
 
 def read_task(path_or_dict: str | PathLike[str] | ReadOnlyValues, goal: Goal | None) -> NamedValues:

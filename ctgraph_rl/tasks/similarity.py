@@ -30,10 +30,8 @@ ROUNDING = 1e-9
 """Actions are equally good within this difference, relative to the task's largest value."""
 
 MAX_COMPARED_BYTES = 2**31
-"""Largest image set that is compared."""
 
 CHOOSING = (StateType.WAIT, StateType.DECISION)
-"""States whose actions matter."""
 
 ON_THE_WAY = 0
 ELSEWHERE = 1
@@ -165,7 +163,6 @@ def _tasks(tasks: Sequence[Task]) -> tuple[Task, ...]:
 
 
 def _matrix(items: Sequence[Any], share: Callable[[Any, Any], float]) -> Tensor:
-    """Return a symmetric measure of all pairs; float64 [n, n]."""
     matrix = torch.zeros(len(items), len(items), dtype=torch.float64, device="cpu")
     for i, one in enumerate(items):
         for j, other in enumerate(items[: i + 1]):
@@ -216,7 +213,6 @@ def _choices(tasks: tuple[Task, ...], gamma: float) -> list[_Choices]:
 
 
 def _optimal_sets(task: Task, gamma: float, num_actions: int) -> ActionSets:
-    """Backward induction as in `values`, keeping the optimal actions."""
     tree = smallest_tree(task, is_needle(task))
     best = BestActions(task, gamma)
     step = task.step_reward
@@ -277,7 +273,6 @@ def _nodes(own_b: int, b: int, level: int) -> list[int]:
 
 
 def _shown_with_actions(choice: _Choices) -> Iterator[tuple[Sequence[int], int]]:
-    """Ids, and the actions that are optimal in every state that shows them."""
     task = choice.task
     for kind in CHOOSING:
         if not task.observations.is_unique(kind):
@@ -334,7 +329,6 @@ def _contents(task: Task, ids: Sequence[int]) -> Iterator[bytes]:
 
 @lru_cache(maxsize=256)
 def _digests(images: ImageSet) -> list[bytes]:
-    """A hash of every image; vectors without their last zeros."""
     rows = images.bank(0).numpy()
     vectors = rows.ndim == 2
     shape = repr(rows.shape[2:]).encode()

@@ -252,7 +252,6 @@ def _value_of_table(task: Task, policy: Tensor, gamma: float) -> float:
 
 
 def _value_at_home(tree: _EveryNode | _GoalPath, chooser: BestActions | _Memoryless) -> float:
-    """Backward induction from the end states; home's step is not rewarded."""
     after_end = chooser.gamma * tree.task.step_reward if tree.task.extra_end_step else 0.0
     values = chooser.at_wait(tree.end_rewards() + after_end, tree.task.graph.depth)
     for level in reversed(range(tree.task.graph.depth)):
@@ -274,8 +273,6 @@ def smallest_tree(task: Task, collapses: bool) -> _EveryNode | _GoalPath:
 
 @dataclass(frozen=True)
 class _EveryNode:
-    """All b^k nodes of a level, in heap order."""
-
     task: Task
 
     def end_rewards(self) -> Tensor:

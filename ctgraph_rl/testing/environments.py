@@ -18,7 +18,6 @@ from ctgraph_rl.tasks.protocol import Block, Protocol
 from ctgraph_rl.tasks.switch import ByEpisode
 
 NUM_STEPS = 40
-"""Of a test, in which at least one row should end an episode."""
 
 TOO_LONG = f"no episode ended in {NUM_STEPS} steps: give tasks with a shorter time limit"
 
@@ -156,7 +155,6 @@ class EnvironmentContract(_OfTasks):
             self._follow_ids(env, env.reset(), lambda episodes: episodes % 2 == 1)
 
     def _follow_ids(self, env: Any, data: TensorDictBase, is_second: Callable[[Tensor], Tensor]) -> None:
-        """Assert that rows show the second task where due after so many episodes, [N, 1], else the first."""
         episodes = torch.zeros(3, 1, dtype=torch.int64, device="cpu")
         for _ in range(NUM_STEPS):
             step, data = env.step_and_maybe_reset(env.rand_action(data))

@@ -58,8 +58,6 @@ class Masks(TaskMethod):
         rule = f"{type(self).__name__} masks weight matrices, and {', '.join(vectors)} are none"
         require((not vectors, f"{rule}: take another method, or a network without such layers"))
         self.ended = 0
-        """Number of tasks with stored scores."""
-
         scores = weights.zeros().repeat(self.num_tasks, 1)
         own = self.initial_scores()
         if self.backbone_seed is not None:

@@ -29,7 +29,6 @@ from ctgraph_rl.tasks.kinds.task_like import TaskLike, most_actions
 EMBEDDINGS = ("lwe", "swe")
 
 STREAM = 0x5E1EC7
-"""Added to the agent's seed for a selection's draws."""
 
 
 def own_generator(stream: int = STREAM) -> torch.Generator:
@@ -130,8 +129,6 @@ class SelectedMasks(MaskLC):
     stackable = False
 
     compares = True
-    """Whether `choose` reads the embeddings."""
-
     community: Tensor  # scores of the selected tasks, and of others with a share of 0, float32 [n, P]
 
     def __init__(self, every: int, **embedding: Any) -> None:
@@ -201,7 +198,6 @@ class SelectedMasks(MaskLC):
         return self.combine(self.community)
 
     def _gather(self, slots: list[int]) -> None:
-        """Copy the selected tasks' scores, filled up to 4, 16, 64 ..., as each number is compiled."""
         room = 4
         while room < len(slots):
             room *= 4

@@ -143,7 +143,6 @@ class SelfLabelledAgent(nn.Module):
     """
 
     events = ("alarm", "rolled_back")
-    """Measurements of a batch's end."""
 
     def __init__(self, learner: Agent, detector: Judge, policy: nn.Module, max_labels: int) -> None:
         super().__init__()

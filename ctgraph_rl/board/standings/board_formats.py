@@ -26,7 +26,6 @@ LEGEND = (
 
 
 NOT_IN_LATEX = ("method", "bytes of the agent", "steps")
-"""Columns that LaTeX leaves out or places elsewhere."""
 
 
 class BoardColumn(NamedTuple):
@@ -154,7 +153,6 @@ ENTRY_COLUMNS = {
     "hours": "hours of computing of all its runs",
     "level": f"how far it was verified: {', '.join(map(shown_level, LEVELS))}; scores: not by bits",
 }
-"""Columns of ``entries.csv`` with their meaning."""
 
 SCORE_COLUMNS = {
     "submission": "first digits of the submission's digest",
@@ -162,7 +160,6 @@ SCORE_COLUMNS = {
     "metric": "name of the metric",
     "value": "its value; empty where it is undefined or the run failed",
 }
-"""Columns of ``scores.csv`` with their meaning."""
 
 
 def entries_csv(tables: Sequence[BoardTable]) -> str:

@@ -26,7 +26,6 @@ LEVELS = ("failed", "submitted", "rescored", "rerun", "held_out")
 """How far a submission was verified, in rising order; ``failed``: a verification found a difference."""
 
 OF_FILES = {"none": "failed", **{level: level for level in LEVELS[2:]}}
-"""Levels by their names in ``verification.json``."""
 
 FIELDS = (
     *("schema", "level", "bits", "digest", "number", "cells", "held_out_seeds", "isolation", "checks"),
@@ -206,7 +205,6 @@ def verification_of(submission: Submission) -> Verification:
 
 
 def _check_verification(given: Any) -> None:
-    """Refuse what is no ``verification.json``, or a level that does not follow from its checks."""
     require((isinstance(given, dict), f"it must be an object, got {given!r:.80}"))
     unknown = [name for name in given if name not in FIELDS]
     present = {name: given.get(name) for name in ("schema", "level", "checks")}
@@ -231,7 +229,6 @@ KINDS = {
     "bits": Kind(lambda value: isinstance(value, bool), "true or false"),
     "checks": list_of(Kind(_is_check, ""), "a list of checks with what, level and passed"),
 }
-"""Fields of ``verification.json`` that a board reads."""
 
 
 def shown_level(level: str) -> str:

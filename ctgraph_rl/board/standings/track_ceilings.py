@@ -101,7 +101,6 @@ def _most_reached(goals: Iterable[tuple[int, ...]]) -> int:
 
 
 def _search(tasks: Sequence[Task], episodes: int) -> float | None:
-    """Return the mean return of a search without repetition, over all episodes of a goal; None where goals stay."""
     ends = {task.graph.num_end_states for task in tasks}
     whole = all(task.goal_change == (episodes, episodes) for task in tasks) and ends == {episodes}
     return (episodes + 1) / (2 * episodes) if whole and all(map(_is_plain, tasks)) else None

@@ -18,7 +18,6 @@ from ctgraph_rl.report.sections import Result, Section
 from ctgraph_rl.report.style import MOST_AGENTS, agent_style, beside, figure_width, new_figure, short
 
 FEWEST_SEEDS = 3
-"""Finished seeds from which an agent is shown."""
 
 RESAMPLES = 2000
 """Bootstrap samples, as in rliable's examples."""

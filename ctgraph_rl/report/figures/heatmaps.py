@@ -14,13 +14,10 @@ from ctgraph_rl.report.sections import Estimates, Result, Section
 from ctgraph_rl.report.style import beside, figure_width, ink, new_figure, short
 
 MOST_NUMBERS = 10
-"""Tasks up to which cells have numbers."""
 
 MOST_INTERVALS = 5
-"""Tasks up to which cells have intervals."""
 
 MOST_NAMES = 32
-"""Tasks up to which each has its name."""
 
 NEGATIVE = -0.05
 """Share of the scale from which a cell without number is marked as negative."""
@@ -95,16 +92,6 @@ def _draw(
     labels: Sequence[str],
     first: int = 0,
 ) -> None:
-    """Draw the cells, grey for none, with means and intervals where there is room.
-
-    Args:
-        axes: where they go.
-        matrix: rows of estimates.
-        colours: name of a colour map.
-        scale: its lowest and highest value.
-        labels: of the tasks.
-        first: the first row's block; from 1 on rows are changes and have a sign.
-    """
     axes.set_facecolor(NO_VALUE)
     values = _values(matrix)
     cells = values if values.size else [[math.nan]]

@@ -27,14 +27,11 @@ from ctgraph_rl.runs.read import UNIT_METRICS, histories
 MOST_TASKS = 32
 
 MANY_BLOCKS = 12
-"""Blocks from which the lines at their ends are thinner."""
 
 MOST_SEEDS = 20
-"""Seeds up to which each has a thin line."""
 
 BANDS = f"from {FEWEST_FOR_BANDS} seeds on the 95 % interval of their mean"
 LabelPlaces = Sequence[tuple[float, float]]
-"""Values after numbers of frames."""
 
 COLUMNS = 4
 

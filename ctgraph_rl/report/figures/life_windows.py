@@ -16,7 +16,6 @@ from ctgraph_rl.tasks.curriculum import LAGS, Stream
 from ctgraph_rl.tasks.gain import lost_by_policies
 
 LINES = {"optimal": "-", "search": "-.", "memoryless": "--", "random": ":"}
-"""Looks of policies that do not learn."""
 
 PANELS = {
     "window_return": "return at the block's end",

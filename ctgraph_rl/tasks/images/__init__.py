@@ -11,7 +11,6 @@ from ctgraph_rl.tasks.images.one_hot import OneHot
 from ctgraph_rl.tasks.images.reference_images import ReferenceImages, ReferenceOneHot
 
 IMAGE_SETS = (PaperImages, GroupedImages, OneHot, ImageFile, ReferenceImages, ReferenceOneHot)
-"""Every image set of this package."""
 
 __all__ = [
     "IMAGE_SETS",

@@ -33,7 +33,6 @@ UNRELATED = (WHITE + 2) / (3 * (WHITE + 1))
 _ROTATED_AT_ONCE = 4096
 
 _BYTES_OF_A_PIXEL, _BYTES_OF_A_BLUEPRINT, _BYTES_OF_A_CELL = 8, 800, 64
-"""Memory in use while images are made."""
 
 _GROUPED_BLOCK = 1 << 27  # the upper half of the image stream's blocks; `PaperImages` uses block 0
 
@@ -186,7 +185,6 @@ def _render(blueprints: Tensor, size: int) -> Tensor:
 
 @lru_cache(maxsize=64)
 def _grouped_images(image_set: GroupedImages) -> Tensor:
-    """Each group's first candidates that repeat no image; candidate k of all groups precedes k + 1."""
     groups = image_set.groups
     cells = image_set.cells
     candidates = max(groups)
@@ -203,7 +201,6 @@ def _grouped_images(image_set: GroupedImages) -> Tensor:
 
 
 def _candidates(image_set: GroupedImages, count: int) -> Tensor:
-    """int64 [count, G, c * c]: each group's first candidates, as levels."""
     seed = image_set.seed
     cells = image_set.cells
     kept_by_image = 1 - image_set.within / UNRELATED  # (1 - s_i)^2

@@ -51,7 +51,6 @@ def distances(images: Tensor, groups: Sequence[int]) -> Distances:
 
 
 def _counts_up_to_level(images: Tensor) -> Tensor:
-    """int64 [pixels * 256]: images with at most a level at a pixel."""
     pixels = images.flatten(1).to(torch.int64)
     count = pixels.shape[1]
     place = pixels + 256 * torch.arange(count, device=images.device)

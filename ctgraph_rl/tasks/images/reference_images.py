@@ -150,7 +150,6 @@ def _rotate(images: np.ndarray, degrees: int) -> np.ndarray:
 
 @lru_cache(maxsize=_ANGLES)
 def _sources(size: int, degrees: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns that the rotated image's pixels come from, float64 [r, r] each."""
     angle = math.radians(degrees)
     centre = (size - 1) / 2
     cos = math.cos(angle)
@@ -162,5 +161,4 @@ def _sources(size: int, degrees: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _fused(a: float, b: float, c: float) -> float:
-    """a b + c, rounded once, as in recorded sets."""
     return float(Fraction(a) * Fraction(b) + Fraction(c))

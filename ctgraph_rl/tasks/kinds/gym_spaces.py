@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from ctgraph_rl.checks import plain, require
 
 CHANNELS = (1, 3, 4)
-"""Lengths of an axis of channels: grey, colours, and colours with alpha."""
 
 LARGEST = float(np.finfo(np.float32).max)
 
