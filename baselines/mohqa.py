@@ -7,14 +7,13 @@ average <- d average + (1 - d) phi.
 
 After each action the eligibility decays, E <- exp(-1 / tau) E. Its row of that action changes by +c where y is largest,
 by -c where it is smallest, and by -h elsewhere. E = 0 at the start of an episode. With reward r, W_h <- clip(W_h +
-(sign(r) - b) E, -1, 1). So a wait does not hide the decision from the reward. Targets are r + gamma max(q' + u') with a
-copy of all weights and the transition's stored average. The published loss is |q - target|^2: the prediction lacks u,
-and q, at most 1, cannot reach a target above 1. ``predict_sum`` corrects it to |q + u - target|^2 with a constant u.
+(sign(r) - b) E, -1, 1). Targets are r + gamma max(q' + u') with a copy of all weights and the transition's stored
+average. The published loss is |q - target|^2: the prediction lacks u, and q, at most 1, cannot reach a target above 1.
+``predict_sum`` corrects it to |q + u - target|^2 with a constant u.
 
 One environment and batches of one step give the paper's updates exactly. With more, W_h changes after the batch, step
-by step, by the sum over environments; each has an E and an average, and a new one starts with the mean average. The
-encoder is that of the other agents. State takes 4 num_features (num_actions + 1) bytes an environment, W_h and its copy
-8 num_features num_actions.
+by step, by the sum over environments; each has an E and an average, and a new one starts with the mean average. State
+takes 4 num_features (num_actions + 1) bytes an environment, W_h and its copy 8 num_features num_actions.
 """
 
 from __future__ import annotations
@@ -98,11 +97,7 @@ class Projected(nn.Module):
 
 
 class HebbianHead(nn.Module):
-    """The weights W_h, and how eligibility and weights change.
-
-    Args:
-        num_actions: rows of W_h.
-    """
+    """The weights W_h, and how eligibility and weights change."""
 
     weights: Tensor
 
@@ -145,10 +140,7 @@ class ModulatedGreedy(TensorDictModuleBase):
     """The policy: greedy on q + u, with exploration; writes eligibility and average.
 
     Args:
-        trunk: computes phi.
         head: computes q, an ``nn.Module`` in a TensorDictModule.
-        hebbian: computes u.
-        exploration: replaces some actions by random ones.
     """
 
     def __init__(

@@ -5,19 +5,17 @@ Rakelly et al. 2019, "Efficient off-policy meta-reinforcement learning via proba
 
     q(z | c) = N(mu, s),    1/s = sum_i 1/s_i,    mu = s sum_i mu_i/s_i,    N(0, 1) without a step.
 
-A row draws z before each episode of a trial. The losses are those of soft actor-critic for discrete actions
-(Christodoulou 2019, arXiv 1910.07207), given z of a posterior of the same trial, with the smaller of two critics Q:
+A row draws z before each episode of a trial. The losses are means over steps, those of soft actor-critic for discrete
+actions (Christodoulou 2019, arXiv 1910.07207), given z of the same trial, with the smaller of two critics Q:
 
     loss_value = sum_j (Q_j(o, a, z) - k r - gamma V')^2
     V' = sum_b pi(b | o', z) (min_j Q'_j(o', b, z) - alpha log pi(b | o', z))
     loss_policy = sum_b pi(b | o, z) (alpha log pi(b | o, z) - min_j Q_j(o, b, z))
     loss_context = kl_coeff KL(q(z | c) || N(0, 1))
 
-They are means over steps. The encoder of mu_i and s_i gets no gradient of loss_policy. Q' follows Q.
-
-Each trial counts as a task. Replay holds the last steps of all rows; a context and the steps of the other losses come
-from one trial. As a context is a set of steps, it shows the goal only if the rewarded observation differs from other
-end states'.
+The encoder of mu_i and s_i gets no gradient of loss_policy. Q' follows Q. Each trial counts as a task.
+Replay holds the last steps of all rows; a context and the steps of the other losses come from one trial. As a context
+is a set of steps, it shows the goal only if the rewarded observation differs from other end states'.
 """
 
 from __future__ import annotations

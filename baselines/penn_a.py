@@ -1,12 +1,12 @@
 """PENN-A: a population of plastic neuromodulated networks evolves, and each learns within its life, without gradients.
 
 Ben-Iwhiwhu et al. 2020, "Evolving inborn knowledge for fast adaptation in dynamic POMDP problems" (GECCO, arXiv
-2004.12846). An individual lives several trials, a row each, and its fitness is the mean sum of their rewards over
+2004.12846). An individual lives several trials, a row each. Its fitness is the mean sum of rewards over
 ``life_episodes`` episodes. It gets no reward, but sees the image of an end state.
 
-Observations become 16 latents of an autoencoder, scaled by the largest one, logit(l / max l) clipped to [0, 1]. They
-and a constant 1 are the inputs of neurons, of which the first one acts: an output above 1/3 is action 2, one below -1/3
-action 1, else 0. At each step, five times, with x the inputs and the last outputs with a little noise,
+Observations become 16 latents of an autoencoder, logit(l / max l) clipped to [0, 1]. They and a constant 1 are the
+inputs of neurons. The first neuron acts: an output above 1/3 is action 2, one below -1/3 action 1, else 0. At each
+step, five times, with x the inputs and the last outputs with a little noise,
 
     y_i = tanh(1/2 sum over inputs and standard j of w_ji x_j),  m_i = tanh(1/2 sum over modulatory j of w_ji x_j),
     w_ji <- clip(w_ji + m_i r (A z_j y_i + B z_j + C y_i + D), -10, 10),  z the inputs and y without noise.
@@ -15,11 +15,11 @@ Weights from modulatory neurons stay. A gene g gives w = 10 g^3; a weight below 
 g^3 or 0 below 0.01, and r = 100 g^3. A life begins with these weights.
 
 After a generation the population is cut into segments at a random place. The best of a segment has all its children:
-clones or crossed with a random individual. Then, by independent draws, a neuron is inserted, one duplicated, one
-deleted, and all genes are mutated by +-exp(-180 |u|), u uniform in [-1, 1]. A new neuron is standard or modulatory with
-equal probability, with genes of 0 before. Individuals before the first segment have a child each. The best of all stays
-unchanged as individual 0. The first generation's weights are mutated zeros, with 10 in place of 180, its rule's genes
-uniform. The autoencoder learns from what the population saw.
+clones or crossed with a random individual. Then a neuron may be inserted, one duplicated, one deleted, and genes are
+mutated by +-exp(-180 |u|), u uniform in [-1, 1]. A new neuron is standard or modulatory with equal probability, with
+genes of 0. Individuals before the first segment have a child each. The best of all stays as individual 0. The first
+generation's weights are mutated zeros, with 10 in place of 180, its rule's genes uniform. The autoencoder learns from
+what the population saw.
 
 A greedy evaluation plays the best individual, one that samples the population in turns.
 """
@@ -101,7 +101,6 @@ def live(lives: Population, inputs: Tensor, weights: Tensor, outputs: Tensor) ->
     """Return weights and outputs after a step, computed with rows last, which is fastest.
 
     Args:
-        lives: the individual of each row.
         inputs: of all neurons, [rows, inputs].
         weights: [rows, inputs + neurons, neurons].
         outputs: of the step before, [rows, neurons].
@@ -275,7 +274,6 @@ class Autoencoder(nn.Module):
         num_pixels: numbers of an observation.
         scale: divisor of observations.
         hidden_size: units between observation and latents.
-        num_latents: latents.
     """
 
     def __init__(self, num_pixels: int, scale: float, hidden_size: int, num_latents: int) -> None:

@@ -23,7 +23,6 @@ class SimHashCounts(nn.Module):
     """Counts of observations with the same signs under random projections.
 
     Args:
-        num_inputs: numbers in an observation.
         high: largest value of an observation.
         num_bits: number of projections; observations share a count where all signs agree.
     """

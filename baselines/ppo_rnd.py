@@ -1,12 +1,10 @@
 """PPO with a bonus for observations that a network has not yet learned to predict, for exploration.
 
 Random network distillation, Burda et al. 2019 (arXiv 1810.12894): a predictor g learns the outputs of a fixed random
-network f. A step that leads to observation o' gets the bonus |g(o') - f(o')|^2, which falls as o' is seen more often,
-divided by the standard deviation of its discounted returns. The bonus has a separate critic and discount factor, and
-its return does not end with an episode. PPO learns from the advantages A + bonus_coeff A_bonus.
-
-Both networks read observations that are standardised pixel by pixel and limited to [-5, 5]. Five things differ from the
-paper:
+network f. A step that leads to observation o' gets the bonus |g(o') - f(o')|^2, divided by the standard deviation of
+its discounted returns. The bonus has a separate critic and discount factor, and its return does not end with an
+episode. PPO learns from the advantages A + bonus_coeff A_bonus. Both networks read observations that are standardised
+pixel by pixel and limited to [-5, 5]. Five things differ from the paper:
 
 - Predictor and random network have the same shape.
 - The critic of the bonus shares no layer with the policy, so that lifelong-learning methods act on the policy only.
@@ -14,8 +12,8 @@ paper:
 - Each announced task starts with a new predictor, critic of the bonus and statistics.
 - Statistics of observations start with the first batch, not with a random policy.
 
-Beside PPO's, the agent holds 12 bytes for each weight of the predictor and of the bonus's critic. Each weight of the
-random network and each environment takes 4, each pixel 16.
+Beside PPO's, the agent holds 12 bytes for each weight of the predictor and of the bonus's critic, 4 for each weight of
+the random network and each environment, and 16 for each pixel.
 """
 
 from __future__ import annotations
@@ -43,11 +41,7 @@ LARGEST_INPUT = 5.0
 
 
 class Moments(nn.Module):
-    """Mean and variance of all rows so far, in float64.
-
-    Args:
-        size: numbers in a row.
-    """
+    """Mean and variance of all rows so far, in float64."""
 
     count: Tensor
     mean: Tensor
@@ -79,9 +73,7 @@ class Novelty(nn.Module):
     """The fixed random network, its predictor, and the statistics that scale observations and bonuses.
 
     Args:
-        num_inputs: numbers in an observation.
         hidden_size: width of the hidden layer of both networks.
-        num_features: outputs of both networks.
         high: largest value of an observation.
         num_envs: environments, each with a discounted return of bonuses.
         gamma: discount factor of these returns.

@@ -47,7 +47,6 @@ def rungs(device: torch.device, num_rows: Sequence[int], num_seeds: Sequence[int
     """Yield what is measured, in the order of the table.
 
     Args:
-        device: of environment and agents.
         num_rows: environments of one agent, of those with a goal.
         num_seeds: agents of one job, each with its yaml file's environments.
     """

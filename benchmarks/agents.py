@@ -117,7 +117,6 @@ class Ours:
     """An agent of this package.
 
     Args:
-        seed: decides weights, exploration and environment.
         cell: a file of ``conf/cell``; None: the agent's.
     """
 

@@ -159,7 +159,6 @@ def write_step(
         outputs: buffers of the next observation, and the step's reward, done and outcome.
         state: the fields of `RowState`; ``torch.compile`` returns no named tuples.
         action: int64 [N].
-        words: the present tick's draws.
 
     Returns:
         The next states, and their draws.
@@ -201,7 +200,6 @@ def parsed(parser: argparse.ArgumentParser, arguments: list[str] | None, seconds
     """Return the options of a benchmark.
 
     Args:
-        parser: with the options of one benchmark.
         arguments: None: those of this process.
         seconds: default of the least time of a measurement.
         limit: default of the seconds after which no measurement begins.
@@ -222,7 +220,6 @@ def climb(rungs: list[Rung], options: Options, device: torch.device, in_turn: bo
     """Measure a ladder as the options say, or until Ctrl-C.
 
     Args:
-        device: of all rungs.
         in_turn: every round measures each rung once, so that all suffer alike; else each rung is made, measured and
             dropped.
     """

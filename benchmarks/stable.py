@@ -52,10 +52,8 @@ class Stable:
     """An agent of Stable-Baselines3.
 
     Args:
-        name: the corresponding agent of this package.
         given: our hyperparameters.
         way: one of `ways`.
-        seed: decides weights and exploration.
     """
 
     def __init__(self, name: str, given: Mapping[str, Any], task: Task, way: tuple[MakeEnv, bool], seed: int) -> None:

@@ -46,9 +46,6 @@ class Compared(NamedTuple):
 def compare(one: Path, other: Path, bound: float = BOUND) -> Compared:
     """Compare two run directories, finished or not.
 
-    Args:
-        bound: as `ctgraph_rl.parsers.BOUND`.
-
     Raises:
         ValueError: for a directory without a run, and a log or weights that cannot be read.
     """

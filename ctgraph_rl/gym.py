@@ -109,7 +109,6 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
 
         Args:
             seed: start the random stream of (seed, row 0), in [0, 2**63); None: continue the present one.
-            options: unused.
         """
         require(_seed_rule(seed))
         super().reset(seed=seed)

@@ -95,10 +95,6 @@ def become_portable() -> None:
 def restart(environment: Mapping[str, str], arguments: Sequence[str]) -> NoReturn:
     """Start the command again, in the same process, with `VARIABLES` in its environment.
 
-    Args:
-        environment: of the command.
-        arguments: of the command.
-
     Raises:
         ValueError: in a process that was started for something else, such as a notebook's.
     """

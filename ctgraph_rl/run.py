@@ -104,12 +104,7 @@ SEARCHERS = ("ax", "nevergrad", "optuna")
 
 
 class Stop(BaseException):
-    """Takes an error past Hydra, which would print the settings before it.
-
-    Args:
-        error: what stopped the run.
-        message: for the user.
-    """
+    """Takes an error past Hydra, which would print the settings before it."""
 
     def __init__(self, error: Exception, message: str) -> None:
         super().__init__(message)

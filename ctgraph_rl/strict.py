@@ -83,7 +83,6 @@ def json_object(
     Args:
         name: of a content without a file.
         most: bytes of a file.
-        nesting: at most.
 
     Raises:
         ValueError: for an unreadable file, or another value.

@@ -3,13 +3,12 @@
 Modulating masks (Ben-Iwhiwhu et al. 2023, TMLR, arXiv 2212.11110), repository dlpbc/mask-lrl, which has no results. PPO
 had 4 workers x 128 steps; 10 greedy episodes of all tasks were evaluated every 5,120 frames. MaskSC and AMSC ("Lifelong
 Context-Aware Retrieval and Composition for Scalable Knowledge Reuse", 2026), LRL-Baselines (2026), MOSAIC (Nath et al.
-2025, arXiv 2506.05577) and its predecessor: repositories under github.com/DMIU-ShELL. The learner sees a one-hot task
-id, the task's number among all goals of some environments; the launcher of AMSC hides it.
+2025, arXiv 2506.05577) and its predecessor: repositories under github.com/DMIU-ShELL. The task id is the task's number
+among all goals of some environments; the launcher of AMSC hides it.
 
 A family is one image seed and one path; its task at depth d has the path's first d decisions. The fourth family exists
 twice: consistent, or skipping depth 5, with depths 2, 3, 4, 6, 7, 8 and 9 in the groups of depth 2 to 8, named
-``..._skips_d5``. Single agents had 51,200 frames a task in the launchers of nested goals; the scripts' default is
-102,400.
+``..._skips_d5``. Launchers of nested goals gave single agents 51,200 frames a task; the scripts' default is 102,400.
 """
 
 from __future__ import annotations

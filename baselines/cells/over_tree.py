@@ -43,7 +43,6 @@ class Gates(Protocol):
         """Return gradients by ``given``, ``carried`` and the state, without that through ``carried``.
 
         Args:
-            factors: of the steps.
             by: gradients by the parts of the next state.
         """
         ...
@@ -140,7 +139,6 @@ class GatesOverTree(torch.autograd.Function):
         """Return the outputs, [num_histories, H].
 
         Args:
-            ctx: keeps what `backward` reads.
             given: products of inputs, [n, G].
             weight: of the first part of the state, [G, H].
             bias: of that product, [G], or None.

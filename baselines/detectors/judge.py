@@ -55,7 +55,6 @@ class Judge(TakesNumbers):
         """Called once before the first batch.
 
         Args:
-            num_rows: rows of a batch.
             num_steps: steps of a batch; blocks may end with a shorter one.
             num_observations: number of one-hot observations; None for images.
 

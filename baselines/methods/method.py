@@ -100,7 +100,6 @@ class Method(TakesNumbers, Hooks):
 
         Args:
             agent: a `Learner`, or a module with `agent_members` that calls the hooks of ``agent.method``.
-            curriculum: from `prepare`.
 
         Raises:
             ValueError: if agent and method do not fit together.
@@ -217,7 +216,6 @@ class TaskMethod(Method):
         """Return the present weights with a task's part; None for the present task.
 
         Args:
-            task: its id.
             inside: where in the vector of all weights the part is, bool [P].
             kept: the part of each slot, [slots, n].
         """
@@ -243,9 +241,6 @@ class TaskMethod(Method):
 
 class AgentWithMethod(nn.Module):
     """An agent and a method, whose hooks it calls at batches, task changes and evaluation.
-
-    Args:
-        agent: the agent, of which the method becomes a part.
 
     Raises:
         ValueError: if agent and method do not fit together.

@@ -139,7 +139,6 @@ def performance_matrix(make: Callable[[Symbols], Predictor], tasks: Sequence[Tas
 
     Args:
         make: builds the predictor of symbols, such as `baselines.models.table_model.TableModel`.
-        tasks: what is learned, in order.
         num_steps: steps of each of 64 rows to learn from, and as many to test.
 
     Example:

@@ -25,8 +25,6 @@ class GatedLayer(nn.Module):
     """A linear layer with ReLU, and its gate.
 
     Args:
-        num_inputs: width of x.
-        num_outputs: width of y.
         gate: one of `GATES`.
         gate_size: width of W_n x.
     """
@@ -116,9 +114,6 @@ def gated_network(specs: dict[str, TensorSpec], num_extra: int, num_outputs: int
 
     Args:
         specs: of what it sees.
-        num_extra: width of further inputs.
-        num_outputs: width of its output.
-        sizes: further arguments of `GatedNetwork`.
     """
     observation, *others = specs.values()
     num_extra += sum(other.shape.numel() for other in others)

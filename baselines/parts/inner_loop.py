@@ -6,20 +6,16 @@ and plays as many with the adapted ones. The inner loss is that of REINFORCE,
     L = - 1/E sum_e 1/T_e sum_t A_t log pi(a_t | o_t),
 
 over the E episodes of T_e steps before the adaptation. The outer loss is the same over the episodes after it, with the
-ratio of probabilities in place of log pi, and is differentiated through the inner gradient. TRPO (Schulman et al. 2015,
-arXiv 1502.05477) minimises it as published, or PPO by clipped steps of Adam. A = R - b has mean 0 and standard
-deviation 1 over the steps before the adaptation, or over those after it. R is the discounted rest of the episode, b a
-linear function of observation and time (Duan et al. 2016, arXiv 1604.06778), fitted to the episodes before the
-adaptation.
+ratio of probabilities in place of log pi, differentiated through the inner gradient. TRPO (Schulman et al. 2015, arXiv
+1502.05477) minimises it as published, or PPO by clipped steps of Adam. A = R - b has mean 0 and standard deviation 1
+over the steps before, or after, the adaptation. R is the discounted rest of the episode, b a linear function of
+observation and time (Duan et al. 2016, arXiv 1604.06778), fitted to the episodes before the adaptation.
 
 The episodes before the adaptation get no credit, so the policy may drift until it always goes to one goal. PPO counters
-this with ``entropy_coeff``, the weight of the policy's entropy before the adaptation.
+this with ``entropy_coeff``. TRPO bounds the divergence on the played episodes only, so returns can fall once all
+episodes succeed. Both are as published.
 
-TRPO bounds the divergence of adapted policies on the played episodes only. Once all episodes after the adaptation
-succeed, A is what b misses, yet steps are as long as ``max_kl`` allows, so returns can fall. Both are as published.
-
-`torch.func.vmap` runs over all trials as one batch. As weights change between batches, only trials that begin and end
-within one batch count.
+As weights change between batches, only trials that begin and end within one batch count.
 """
 
 from __future__ import annotations
@@ -147,7 +143,6 @@ class InnerModel(nn.Module):
     """A network with weights theta that all trials share, and weights of each trial, which adapt.
 
     Args:
-        net: maps what is seen to logits.
         inner_rate: step size of the adaptation.
     """
 
@@ -189,8 +184,6 @@ class InnerPolicy(TensorDictModuleBase):
     """Acts in each row with the row's weights, and adapts them after enough episodes.
 
     Args:
-        model: the weights, and how they adapt.
-        seen_keys: what the network reads.
         adapt_episodes: episodes before and after the adaptation.
     """
 

@@ -87,8 +87,6 @@ class Encoder(nn.Module):
         shape: shape of one observation.
         high: largest value of an observation.
         num_features: width of every layer.
-        num_layers: linear layers, at least 1.
-        num_extra: width of further inputs.
         num_ids: number of task ids, of which a number is read as a one-hot vector would be; 0: none is read.
         kind: ``mlp``, or ``cnn`` with `Convolutions` before the linear layers.
     """
@@ -190,10 +188,6 @@ class RecurrentModule(TensorDictModuleBase):
     """An encoder and a cell; writes ``memory``, and the cell's state under the cell's keys.
 
     `act` is one step of all rows, `over_time` all steps of sequences.
-
-    Args:
-        encoder: writes the features that the cell reads.
-        cell: what remembers.
     """
 
     def __init__(self, encoder: EncoderModule, cell: Cell) -> None:

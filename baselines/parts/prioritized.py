@@ -25,7 +25,6 @@ class PrioritySampler(Sampler):
     most 1.
 
     Args:
-        num_items: capacity of the storage.
         alpha: exponent of the priorities.
         beta: exponent of the weights; constant, where Schaul et al. raise it to 1.
     """

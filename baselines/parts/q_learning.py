@@ -45,8 +45,6 @@ def require_replay(observation_spec: Composite, buffer_size: int, batch_size: in
 
     Args:
         observation_spec: the environment's, without batch dimensions.
-        buffer_size: steps in the buffer.
-        batch_size: items of a minibatch.
         size: numbers of an item beside its observations.
 
     Raises:
@@ -203,7 +201,6 @@ class QLearner(Learner):
 
         Args:
             greedy: writes the best ``action``.
-            action_spec: the actions that exploration draws from.
             state: keys of the network's recurrent state.
             copied: from `copied_action`.
         """

@@ -26,12 +26,7 @@ from ctgraph_rl.learn.collect import UNSTORED
 
 
 class Quantiles(nn.Module):
-    """A linear layer with K outputs per action, whose mean is the action's value.
-
-    Args:
-        num_actions: A.
-        num_quantiles: K.
-    """
+    """A linear layer with K outputs per action, whose mean is the action's value."""
 
     def __init__(self, num_features: int, num_actions: int, num_quantiles: int) -> None:
         super().__init__()

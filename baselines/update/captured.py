@@ -57,7 +57,6 @@ class Draws:
 
     Args:
         seeds: of each, in [0, 2**63).
-        device: where is drawn.
     """
 
     def __init__(self, seeds: Sequence[int], device: torch.device) -> None:

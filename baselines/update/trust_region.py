@@ -29,11 +29,9 @@ def trust_region_step(
     policy. There it is exactly the Gauss-Newton matrix J' (diag(p) - p p') J of the logits' Jacobian J.
 
     Args:
-        weights: what is changed, with names.
         logits_of: computes logits, [..., num_actions], from weights by name.
         loss_of: computes the loss, a scalar, from logits.
         weight: of each step in the mean divergence, [...]; its sum is 1.
-        max_kl: largest mean divergence.
 
     Returns:
         ``loss_policy`` before the step, ``grad_norm``, ``kl`` of the step and ``step_scale``, 0 where none was taken.

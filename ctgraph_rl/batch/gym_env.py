@@ -39,7 +39,6 @@ class GymEnv(EnvBase):
     environment; `close` closes all.
 
     Args:
-        tasks: one for each row.
         seed: of all episodes, in [0, 2**63).
         task_pool: the tasks that `set_tasks` may be given. Default: ``tasks``.
         task_ids: the id of each task, as in `TaskLike.make_env`.

@@ -56,7 +56,6 @@ def rollout(rows: Rows, policy: TensorPolicy | Tensor, steps: Steps, kernel: str
     Args:
         rows: the batch, left where the last step led.
         policy: what acts, or actions, int64 [T, N].
-        steps: the buffers, from `Steps.empty`; filled in place.
         kernel: ``"auto"`` takes the rows' engine, ``"off"`` the tensor engine and ``"required"`` the C kernel, as in
             `Rows`. Given actions are one call of the kernel.
 

@@ -166,7 +166,6 @@ class Rows(TakesNumbers, nn.Module):
         """Give every row a task, in place.
 
         Args:
-            tasks: one task of the pool per row.
             at_episode_end: each row has its new task from its next reset on. False ends all episodes: `reset` before
                 the next step.
 

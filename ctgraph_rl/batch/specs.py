@@ -31,7 +31,6 @@ def make_specs(
     """Return the specs of an environment for a pool of tasks, on the CPU, without building one.
 
     Args:
-        pool: the tasks that rows may have.
         batch_size: () for unbatched specs, from which agents are built; (N,) for N rows.
         num_task_ids: length of ``task_id``; 0 for none.
         info: with ``step_count``, ``episode_reward``, ``outcome`` and ``leaf``.
@@ -54,8 +53,6 @@ def observation_spec(
     """Return the spec of what rows show, on the CPU.
 
     Args:
-        observation: of their observations.
-        batch_size: as in `make_specs`.
         num_task_ids: length of ``task_id``; 0 for none.
         info: with ``step_count`` and ``episode_reward``.
         ends: with ``outcome`` and ``leaf``.

@@ -25,10 +25,6 @@ class DrawsAhead:
     """The draws of rows, `dynamics.Words`, for their present and following ticks.
 
     A compiled step makes its draws itself: a table would need a graph for each tick of it.
-
-    Args:
-        params: the rows' parameters.
-        uses: what the rows draw for.
     """
 
     def __init__(self, params: RowParams, uses: Uses) -> None:

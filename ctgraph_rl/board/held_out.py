@@ -85,9 +85,6 @@ def other_curriculum(curriculum: Curriculum, key: str) -> Curriculum:
     Every generated image set gets another seed, equal ones the same; image sets without a seed stay. The branches of
     every decision state are renamed, in all tasks alike, so goals still share their first decisions. Tasks that are no
     CT-graphs stay; only the seeds change.
-
-    Args:
-        key: decides images and goals.
     """
 
     def other(task: TaskLike) -> TaskLike:
@@ -121,8 +118,6 @@ def renamed(path: tuple[int, ...], branching_factor: int, key: str) -> tuple[int
 
     Args:
         path: decisions from the home state, in 1..b.
-        branching_factor: b.
-        key: decides the new names.
     """
     branches = range(1, branching_factor + 1)
     new = []

@@ -144,8 +144,6 @@ def isolation(folder: Path, limits: Limits, graphics: bool = False) -> Isolation
 
     Args:
         folder: an existing directory for that process.
-        limits: of the processes that will run.
-        graphics: whether the code of others may use the graphics cards.
     """
     found = bubblewrap_version()
     shown = ".".join(map(str, found or ()))
@@ -201,8 +199,6 @@ def run_isolated(
     Args:
         command: starts with an absolute path.
         folder: an existing directory, the only one that it may change; its working directory and home.
-        limits: what it may use.
-        isolated: how it is isolated; the user agreed to what is not.
         paths: folders that it may read beside the system's and Python's.
         variables: of its environment, beside `KEPT`.
 

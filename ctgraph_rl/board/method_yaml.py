@@ -174,7 +174,6 @@ def completed(method: ReadOnlyValues, facts: Mapping[str, ReadOnlyValues]) -> Na
 
     Args:
         method: content of a ``method.yaml``.
-        facts: from `facts_of`.
     """
     filled = dict(method)
     for part, known in facts.items():
@@ -201,8 +200,6 @@ def fact_rules(
 
     Args:
         method: content of a ``method.yaml``.
-        facts: from `facts_of`.
-        num_tasks: of the curriculum.
     """
     rules = []
     for key, known in facts["given"].items():

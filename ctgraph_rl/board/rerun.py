@@ -301,12 +301,7 @@ def _size_check(run: SubmittedRun, found: int | None, other_bits: Sequence[str])
 
 
 def check_of_scores(submission: Submission, found: Sequence[float], what: str, level: str, note: str = "") -> Check:
-    """Test whether scores are lower than the submitted ones, and say what the test could find.
-
-    Args:
-        found: the other scores.
-        note: why scores are compared and not bits.
-    """
+    """Test whether scores are lower than the submitted ones, and say what the test could find."""
     submitted = submitted_scores(submission)
     if not submitted or not found:
         why = f"{len(submitted)} submitted runs and {len(found)} others have a value of {score_name(submission)}"
@@ -321,10 +316,6 @@ def verified(submission: Submission, results: Mapping[SubmittedRun, Rerun], othe
     """Return the checks of all runs that were learned again.
 
     Bits are compared first. Where they differ and are not promised, scores are tested instead.
-
-    Args:
-        results: of each run that was learned again.
-        other_bits: from `why_other_bits`.
     """
     name = score_name(submission)
     every: list[Check] = []

@@ -145,8 +145,6 @@ class Submission:
         method: from ``method.yaml``.
         config: of all runs, without the seed.
         versions: of packages that computed them, by name.
-        curriculum: what they learned.
-        runs: sorted by seed.
         track: that it is for, or None.
         digest: SHA-256 of ``submission.json``, which has the sums of all logs.
     """

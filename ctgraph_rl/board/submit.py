@@ -52,10 +52,7 @@ def submit(
     """Make a submission of runs; return it, read from its folder.
 
     Args:
-        paths: run directories, or folders that hold them.
-        to: the folder to make; must not exist.
         method: content of a ``method.yaml``, from `ctgraph_rl.board.method_yaml.read_method`.
-        of_track: the track that it is for, or None.
         only: settings by dotted names, such as ``{"curriculum.depth": 4}``; runs with others are left out.
 
     Raises:

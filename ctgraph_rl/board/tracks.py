@@ -56,7 +56,6 @@ class Variant:
     Args:
         settings: changes of ``track=NAME``, as on the command line.
         rung: of a ladder, in words; empty for one curriculum.
-        curriculum: with protocol and evaluation.
     """
 
     settings: tuple[str, ...]
@@ -74,10 +73,7 @@ class Track:
     """A track, from its file in ``conf/track``.
 
     Args:
-        name: of the file.
         version: rises with every change that makes results incomparable.
-        measures: a sentence.
-        breakthrough: a sentence.
         score: the metric that orders a table.
         rungs: settings of each rung; one without settings for a single curriculum.
         less_given: changes of the protocol for learners that are given less.

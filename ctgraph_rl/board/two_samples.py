@@ -61,10 +61,6 @@ def compare_samples(submitted: Sequence[float], found: Sequence[float]) -> Diffe
     The chance to call equal distributions different is at most `ALPHA`. The interval holds all drops that the test does
     not exclude, on either side. The stated power is of normal scores with the standard deviation within both groups.
 
-    Args:
-        submitted: one or more scores of the submitted runs.
-        found: one or more scores of the repeated runs.
-
     Raises:
         ValueError: for a group without scores.
     """
@@ -94,12 +90,7 @@ def runs_needed(submitted: int) -> int:
 
 @cache
 def detectable(submitted: int, found: int) -> float:
-    """Return the drop, in standard deviations of normal scores, found with a chance of `POWER`; infinite if none is.
-
-    Args:
-        submitted: number of submitted scores.
-        found: number of the others.
-    """
+    """Return the drop, in standard deviations of normal scores, found with a chance of `POWER`; infinite if none is."""
     if 1 / math.comb(submitted + found, found) > ALPHA:
         return math.inf
     noise = np.random.default_rng(0).standard_normal((SAMPLES, submitted + found))

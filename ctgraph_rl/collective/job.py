@@ -100,11 +100,7 @@ def _learn(session: Session, cfg: Any, cells: Sequence[ConfigAndPath], exchange:
 
 
 class Exchanging(SessionCoupling):
-    """A coupling of learners that exchange messages by `learn_collective`.
-
-    Args:
-        checkpoints: those of all members together.
-    """
+    """A coupling of learners that exchange messages by `learn_collective`."""
 
     def __init__(self, cfg: Any, exchange: ExchangeLike, run_dir: Path, checkpoints: Checkpoints) -> None:
         self.cfg = cfg

@@ -65,9 +65,6 @@ def find_collectives(paths: Sequence[Path | str]) -> list[Collective]:
 def write_report(paths: Sequence[Path | str], folder: Path) -> Path:
     """Write ``collectives.md`` with its figures, ``collectives.csv`` and the tidy tables; return the page.
 
-    Args:
-        paths: directories of collectives, or folders that hold them.
-
     Raises:
         ModuleNotFoundError: before any work, without what the extra ``report`` installs.
         ValueError: if no collective can be read.

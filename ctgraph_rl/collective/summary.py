@@ -51,13 +51,7 @@ class Learned(NamedTuple):
 
 @dataclass(frozen=True)
 class Collective:
-    """A collective as data.
-
-    Args:
-        about: the values of `RUN`.
-        learned: of each member and block.
-        helps: what was taken over.
-    """
+    """A collective as data."""
 
     path: Path
     about: ReadOnlyValues

@@ -87,7 +87,6 @@ def splitmix64(start: Tensor, count: int) -> Tensor:
 
     Args:
         start: int64 [...], the seed of each sequence.
-        count: how many numbers.
 
     Returns:
         int64 [..., count], all 64 bits random.

@@ -36,9 +36,6 @@ def image_figure(task: Task, seed: int = 0) -> Any:
 
     Where images vary on read, by noise, rotation or instances, a line holds the image of one id and seven observations
     of it; else eight ids of a kind.
-
-    Args:
-        seed: of the observations.
     """
     x = task.observations
     varies = x.read_noise or x.read_rotation or task.images.num_variants > 1

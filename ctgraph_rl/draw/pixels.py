@@ -70,7 +70,6 @@ def render(
     current node and the goal, with stubs.
 
     Args:
-        tasks: the rows' tasks, N in all.
         state_type: int64 [N], values of `StateType`.
         node: int64 [N], heap indices of the positions.
         goal_leaf: int64 [N], numbers of the end states with the goal.

@@ -24,7 +24,6 @@ def draw_similarity(curriculum: Curriculum, path: Path | str) -> None:
     """Draw a heat map of each measure over a curriculum's tasks.
 
     Args:
-        curriculum: its tasks, in order of first appearance.
         path: the picture; its ending decides the format.
 
     Raises:

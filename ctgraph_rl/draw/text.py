@@ -20,8 +20,6 @@ def as_text(tasks: Sequence[Task], state: RowState, observation: Tensor, white: 
     """Return a text for every row.
 
     Args:
-        tasks: the rows' tasks, N in all.
-        state: the rows' states.
         observation: uint8 [N, 1, r, r], or [N, K] when one-hot.
         white: the largest value of an observation.
     """

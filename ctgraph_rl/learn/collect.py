@@ -126,7 +126,6 @@ def collect(
     """Yield batches of [rows, num_steps] in time order, starting with a reset; the last one may be shorter.
 
     Args:
-        env: where to act.
         policy: writes ``action`` and, if recurrent, its state under ``("next", key)``.
         num_frames: a multiple of the rows.
         initial_state: gives the rows' first recurrent state.

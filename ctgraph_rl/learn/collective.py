@@ -82,11 +82,7 @@ class Member:
     """A learner of a collective.
 
     Args:
-        agent: the learner; shared with no other member.
-        seed: of its environment.
-        log: where its measurements are appended.
         random: its state of torch's global generator; default: the present one, so make a member right after its agent.
-        log_units: as `ctgraph_rl.learn.lifelong.learn_curriculum`.
     """
 
     curriculum: Curriculum
@@ -115,8 +111,6 @@ def learn_collective(
     answers, and takes over nothing.
 
     Args:
-        exchange: what messages they send, and when.
-        seed: decides which messages are lost or late.
         log: of the collective: lines ``exchange`` for messages and ``help`` for what members took over. The members'
             own logs also have the latter. Default: a new one in memory.
         progress: updated after each round with the frames of all members and their mean return.

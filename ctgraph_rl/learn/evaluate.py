@@ -55,7 +55,6 @@ def evaluate(
     Args:
         policy: what plays. A class such as `ctgraph_rl.policies.OptimalPolicy` is built on the environment; a plain
             module maps observations to logits, see `LogitsPolicy`.
-        num_episodes: episodes per task.
         seed: of the environment and, if not greedy, of the policy's draws.
         greedy: take the most likely actions; False samples and explores as in training.
         episodes_per_row: successive episodes of a row, a divisor of ``num_episodes``. Goals that change between
@@ -198,9 +197,7 @@ class Evaluator:
     """Evaluates as a curriculum says, and appends the results to a log.
 
     Args:
-        curriculum: says when and how.
         seed: of the run; each evaluation derives one.
-        device: of the environments.
         untrained: the agent's policy before any training, which a stream evaluates on each new task, too.
     """
 
@@ -350,7 +347,6 @@ def evaluate_together(
     """Evaluate members of one curriculum of CT-graphs in one environment, with the bits of one at a time.
 
     Args:
-        agents: of each member.
         policy: acts for all members, each with as many adjacent rows, and greedily; None: each acts in turn.
         logged: positions of those whose lines are appended; None: all.
     """
@@ -387,12 +383,7 @@ def evaluate_together(
 
 
 class InTurn:
-    """A policy of equal slices of rows, each with a separate generator.
-
-    Args:
-        policies: of each slice.
-        seeds: of each generator.
-    """
+    """A policy of equal slices of rows, each with a separate generator."""
 
     def __init__(self, policies: Sequence[Policy], seeds: Sequence[int]) -> None:
         self.policies = policies

@@ -1,9 +1,8 @@
 """Exact mean return, success rate, end rate and length of a policy on a CT-graph, without episodes.
 
-Without noise on reading, an agent can have seen finitely many things. A policy without memory is a table by image,
-valued by backward induction (`ctgraph_rl.tasks.values`). With memory, all histories are played at once with their
-probabilities. They branch at decisions, at waits and where images are drawn, as an action that fails ends an episode.
-The graph gives this tree. `ctgraph_rl.learn.histories` finds that of a batch by comparing frames, which are not here.
+A policy without memory is a table by image, valued by backward induction (`ctgraph_rl.tasks.values`). With memory, all
+histories are played at once with their probabilities; without noise on reading, they are finitely many. They branch at
+decisions, at waits and where images are drawn, as an action that fails ends an episode.
 
 Where waits are drawn (p > 0), stays of a probability below `LEAST_STAY` are left out, which changes a success rate by
 less than (d + 1) times that.
@@ -86,7 +85,6 @@ def exact_success(policy: ActionProbs | nn.Module, task: Task) -> float:
     Args:
         policy: maps images, uint8 [n, \\*shape], to action probabilities, float [n, A], or to actions, int64 [n], which
             are deterministic. A plain module maps them to logits, which are sampled.
-        task: a CT-graph without noise on reading.
 
     Raises:
         ValueError: for noise on reading, a changing goal, and probabilities of a wrong shape or sum.
@@ -105,8 +103,6 @@ def exact_value(policy: ActionProbs | nn.Module, task: Task, gamma: float = 1.0)
     """Return the expected discounted return of a policy without memory.
 
     Args:
-        policy: as in `exact_success`.
-        task: as in `exact_success`.
         gamma: discount, in [0, 1]; 1 gives the mean return.
     """
     require(*fraction(gamma=gamma))

@@ -30,7 +30,6 @@ class Guide:
     episode.
 
     Args:
-        env: where it acts.
         guide_frames: frames over which the share falls from 1 to 0.
     """
 

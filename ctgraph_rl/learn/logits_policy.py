@@ -27,7 +27,6 @@ class LogitsPolicy:
 
     Args:
         module: maps float [n, 1, r, r] or [n, K] to float [n, num_actions].
-        num_actions: logits of a row.
     """
 
     def __init__(self, module: nn.Module, num_actions: int) -> None:

@@ -171,12 +171,9 @@ class Lockstep:
     A member with a loss or weight that is not finite has failed and measures nothing from then on.
 
     Args:
-        seeds: of each.
-        logs: where each appends its measurements.
         saved: what `state` returned, to resume from; None: the beginning.
         until: the share of the curriculum's frames after which learning ends, with the batch that reaches it.
         freeze_after: the share after which no agent learns from a batch that ends later, or is notified of tasks.
-        log_units: as `ctgraph_rl.learn.lifelong.learn_curriculum`.
 
     Raises:
         ValueError: for a curriculum that the learners cannot learn.

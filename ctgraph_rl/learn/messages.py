@@ -22,9 +22,6 @@ class Message:
 
     Args:
         kind: such as ``query``.
-        sender: number of a learner, from 0.
-        receiver: number of another.
-        content: tensors and numbers by name.
     """
 
     kind: str
@@ -45,11 +42,6 @@ class Mail:
     """Takes messages to their receivers; each is independently lost or late with a stated probability.
 
     A late message arrives at the next exchange. Each message makes two draws, whatever the probabilities.
-
-    Args:
-        drop_prob: probability that a message is lost.
-        delay_prob: probability that one which is not lost is late.
-        seed: of the draws.
 
     Raises:
         ValueError: for probabilities outside [0, 1].

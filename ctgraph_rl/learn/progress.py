@@ -27,7 +27,6 @@ class TextBar:
     """A bar with a text on a terminal, and lines of text elsewhere.
 
     Args:
-        console: where they show; default: standard error.
         transient: the bar disappears at its end.
     """
 
@@ -44,11 +43,7 @@ class TextBar:
 
 
 class StepCounter(TextBar):
-    """A context manager that shows steps done, rate and time left once `QUICK` seconds have passed.
-
-    Args:
-        console: where it shows; default: standard error.
-    """
+    """A context manager that shows steps done, rate and time left once `QUICK` seconds have passed."""
 
     def __init__(self, console: Console | None = None) -> None:
         super().__init__(console, transient=True)
@@ -85,7 +80,6 @@ class ProgressBar(TextBar):
     """A context manager that shows block, frames, rate, return and time left.
 
     Args:
-        console: where it shows; default: standard error.
         done: frames learned before the run was resumed.
     """
 

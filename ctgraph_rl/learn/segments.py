@@ -62,14 +62,10 @@ def collect_segment(
 
     Args:
         segment: what is learned; its frames are those of one seed.
-        env: has the rows of all seeds.
         agent: says how many steps a batch has, and the first recurrent state.
         evaluate: called between two steps with the frames of the run so far.
-        policy: acts in all rows.
         done: frames of the segment that were learned before.
         restore: restores a state between two batches, and returns the data of the next step.
-        num_seeds: seeds that share the rows equally.
-        guide_frames: see `ctgraph_rl.tasks.protocol.Protocol`; only with one seed.
     """
     _set_tasks(env, segment.block_at(segment.start + done), num_seeds)
     carried = None if restore is None else restore()
@@ -130,7 +126,6 @@ def log_training(
     """Append a line of each learner for each block that a batch has frames of; return the last lines' mean returns.
 
     Args:
-        logs: of each learner.
         batch: [learners * rows, steps].
         start: frames of a learner before it.
         measurements: of each learner on the batch; None for one that measures nothing any more.

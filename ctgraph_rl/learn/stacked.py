@@ -50,8 +50,6 @@ def learn_together(
 
     Args:
         curriculum: one for which `why_not_together` has no objection.
-        seeds: of each agent.
-        logs: where each appends its measurements.
         progress: updated after every batch with the mean return of all seeds.
         saved: all states that ``checkpoint`` was given, to resume with the same bits.
         checkpoint: is offered the states after every batch.

@@ -109,7 +109,6 @@ def check(measurement: ReadOnlyValues, most: int = MOST) -> None:
     """Refuse a measurement that this package did not write.
 
     Args:
-        measurement: by `parsed`.
         most: number of blocks and of tasks that its file has room for.
 
     Raises:

@@ -129,7 +129,6 @@ def code_changes(before: ReadOnlyValues, now: ReadOnlyValues) -> list[str]:
 
     Args:
         before: the first line of a log.
-        now: the code of this process.
     """
     stored = before.get("sources")
     fingerprint = before.get("fingerprint")

@@ -7,17 +7,15 @@ Every line is one JSON object with a ``kind``. Schema 1:
 - ``training``: one interval of a block: ``block`` from 1, ``frames`` of the run so far, finished ``episodes`` and their
   ``return_mean``, ``success_rate``, ``end_rate`` (the share that reached an end state) and ``length_mean``; what the
   agent reports. A batch over a hidden boundary has a line per block; an episode counts where it ends.
-- ``evaluation``: means over the evaluation episodes of one task. ``moment`` is ``before`` any training (block 0),
-  ``during`` a block, or ``after`` it. ``task`` counts the curriculum's tasks from 1, then the held-out ones, marked
-  ``held_out``.
-- ``adaptation``: where rows adapt before an evaluation, means over the rows' episodes number ``step``, from 1, and
-  ``found_rate``, the share of rows that have reached the goal by then; ``exact_rate``, the success rate of the best
-  search; else as ``evaluation``.
+- ``evaluation``: means over the episodes of one task. ``moment`` is ``before`` any training (block 0), ``during`` a
+  block, or ``after`` it. ``task`` counts the curriculum's tasks from 1, then those ``held_out``.
+- ``adaptation``: as ``evaluation``, means over the rows' episodes number ``step``, from 1; ``found_rate``, the share of
+  rows that have reached the goal by then; ``exact_rate``, the success rate of the best search.
 - ``units``: `ctgraph_rl.learn.unit_metrics.unit_metrics` on the ``num_images`` of a block's tasks, or fresh ones
   (``images``), at its ``start``, ``during`` it, at its ``end`` or after a ``batch``. ``training`` then has norms.
 
 Numbers that are not finite are null. Only ``seconds``, the time since the start, differs between two equal runs. A
-reader in three lines, for what `RunLog.read` does not give::
+reader in three lines::
 
     import json
     with open("run.jsonl", encoding="utf-8") as file:

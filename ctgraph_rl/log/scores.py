@@ -48,7 +48,6 @@ def scores(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None
     CT-graph, and 101 its optimal value.
 
     Args:
-        log: a whole run.
         experts: for each of ``curriculum.tasks``, the log of its single-task expert.
 
     Raises:

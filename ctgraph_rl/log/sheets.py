@@ -35,10 +35,7 @@ class Sheet:
     """A table.
 
     Args:
-        title: a line above it.
         columns: names, each with ``l`` or ``r`` for alignment.
-        rows: a text per column.
-        notes: lines below it.
     """
 
     title: str

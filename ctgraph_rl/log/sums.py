@@ -31,7 +31,6 @@ def write_metrics(
     Terms are left out, as pairs of tasks grow with the square of tasks; `ctgraph_rl.log.scores.scores` has them.
 
     Args:
-        sums: of the other files of a run.
         of_windows: metrics whose terms are few, and kept as ``windows``.
     """
     content = {name: _values(name, metric, of_windows) for name, metric in metrics.items()}

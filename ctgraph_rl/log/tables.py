@@ -69,8 +69,6 @@ def write_tables(log: RunLog, folder: Path | str, parquet: bool | None = None) -
     """Write ``evaluations``, ``training`` and ``performance.csv`` into a folder; return the files.
 
     Args:
-        log: the run's log.
-        folder: where they go.
         parquet: write Parquet, too; None: if pyarrow is installed.
 
     Raises:

@@ -39,7 +39,6 @@ class Curves:
     Args:
         performance: float64 [evaluations, tasks]; NaN where not evaluated.
         blocks: each evaluation's block; 0 before any training.
-        frames: frames learned by each evaluation.
         trained: each block's tasks, counted from 0.
 
     Raises:

@@ -1,19 +1,17 @@
 """The lifelong metrics of the DARPA L2M programme, as the program l2metrics 3.1.0 computes them.
 
 New et al. 2022 and Baker et al. 2023 define them on regimes: stays on one task, either training or evaluation, each
-with the performance of its experiences in order. An experience is an episode there, a training interval of a run's log
-here. l2metrics first smooths training and scales each task to 1..101: `prepare`. Without given ranges the scale depends
-on the run, and its offset of 1 makes ratios: from 0 to half of the range is a "forward transfer" of 51. Give ranges, or
-take contrasts of unscaled performance.
+with the performance of its experiences in order, here training intervals. l2metrics first smooths training and scales
+each task to 1..101: `prepare`. Without given ranges the scale depends on the run, and its offset of 1 makes ratios:
+from 0 to half of the range is a "forward transfer" of 51. Give ranges, or take contrasts of unscaled performance.
 
-As in l2metrics means leave out tasks and pairs without a value; here they are counted. Deliberate deviations:
+Means leave out tasks and pairs without a value, which are counted. Deliberate deviations from l2metrics:
 
-- Where other tasks are trained between the two evaluations of a transfer, there is no value; l2metrics keeps the last
-  of them, direct learning included.
-- Ratios and contrasts of negative performance, which may read improvement as loss, have no value; nor has a relative
-  performance whose expert has the sum 0, infinite there.
+- Where other tasks are trained between the two evaluations of a transfer, there is no value; l2metrics keeps the last.
+- Ratios and contrasts of negative performance have no value, as they may read improvement as loss; nor has a relative
+  performance whose expert has the sum 0.
 - Values that differ by rounding are equal: a plateau is reached at its start.
-- Of several experts of a task, one without a value makes the task's undefined; l2metrics leaves that expert out.
+- One of a task's experts without a value makes the task's undefined; l2metrics leaves that expert out.
 """
 
 from __future__ import annotations

@@ -50,11 +50,7 @@ class Metric:
 
     Args:
         value: in units of performance; None when undefined.
-        definition: id of the definition.
         formula: with R for the performance matrix and tasks counted from 1.
-        source: where it is defined.
-        undefined: why there is no value.
-        n_undefined: number of terms without a value.
         terms: in order; None for those without a value.
     """
 

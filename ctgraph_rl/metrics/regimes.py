@@ -18,7 +18,6 @@ class Regime:
     """A stay on one task.
 
     Args:
-        task: name of the task.
         training: False for an evaluation.
         values: performance of each experience in order, float64 [experiences].
 
@@ -53,8 +52,6 @@ class RegimeTable(Sequence[Regime]):
     """Regimes as arrays: a run that evaluates T tasks after each of T blocks has more than T^2 of them.
 
     Args:
-        names: the different tasks, by first appearance.
-        columns: the regimes in order.
         values: the experiences of all regimes in order, float64 [experiences].
 
     Raises:

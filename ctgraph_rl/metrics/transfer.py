@@ -37,11 +37,7 @@ def trapezoid_area(curve: Tensor) -> Tensor:
 
 
 def stage_areas(curves: Curves, trapezoids: bool = False) -> Tensor:
-    """Each task's area under its curve over its own block, [tasks]; NaN where a definition has none.
-
-    Args:
-        trapezoids: `trapezoid_area` instead of `mean_area`.
-    """
+    """Each task's area under its curve over its own block, [tasks]; NaN where a definition has none."""
     area = trapezoid_area if trapezoids else mean_area
     areas = []
     for task in range(curves.performance.shape[1]):

@@ -29,8 +29,6 @@ class Selection(NamedTuple):
 
     Args:
         policy: as for `evaluate`, or None.
-        initial_state: of a recurrent policy.
-        curriculum: that a trained policy learned.
     """
 
     task: Task

@@ -123,14 +123,7 @@ class Game:
 
 
 def truth(task: Task, kind: StateType, place: int, goal_leaf: int) -> Tree:
-    """Return a tree as text, with the goal and a place; of a large one the paths to both.
-
-    Args:
-        task: whose tree it is.
-        kind: of the state at the place.
-        place: its node.
-        goal_leaf: number of the end state with the goal.
-    """
+    """Return a tree as text, with the goal and a place; of a large one the paths to both."""
     graph = task.graph
     goal = graph.num_decision_states + goal_leaf
     layout = lay_out(graph, [goal, place], MOST_BRANCHES)
@@ -163,8 +156,6 @@ def picture(observation: NDArray[np.uint8], white: float, colours: bool) -> Text
 
     Args:
         observation: uint8 [1, r, r], or [K] for a vector, shown in lines of 16.
-        white: the brightest level.
-        colours: whether the terminal has them.
     """
     if observation.ndim == 3:
         image = observation[0]

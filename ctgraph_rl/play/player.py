@@ -20,8 +20,6 @@ class Player:
 
     Args:
         policy: acts where no action is given, as for `evaluate`; None: an action must be given.
-        initial_state: gives a recurrent policy's state for a number of rows.
-        seed: of the environment.
         greedy: most likely actions; False samples and explores as in training.
         curriculum: whose task ids the policy sees, if its protocol shows them.
     """

@@ -55,9 +55,6 @@ class _Episodes(NamedTuple):
 def known_bits(folder: Path, agent_class: Any, task: Task) -> KnownBits:
     """Return what the trained agent of a run knows.
 
-    Args:
-        agent_class: of its agent, if known.
-
     Raises:
         Undefined: if it has no ``predict_next``, cannot be loaded, or gives no probabilities.
     """

@@ -27,10 +27,6 @@ COLUMNS = ("agent", "property", "score", "low", "high", "n", "reason", "measured
 def write_profile(paths: Sequence[Path | str], folder: Path | str, agents: Sequence[str] = ()) -> Profiles:
     """Write ``profile.md`` with its figure, ``profile.csv`` and ``profile.tex``; return `profile_scores`.
 
-    Args:
-        paths: folders of runs.
-        agents: names and order of agents.
-
     Raises:
         ModuleNotFoundError: before any work, without what the extra ``report`` installs.
         ValueError: if there is no run of a profile curriculum.

@@ -62,7 +62,6 @@ def above_ceilings(run: Evidence, controls: Sequence[Evidence], sizes: Sequence[
     """The mean over graphs of the lowest return over their goals, above that of policies that only count steps.
 
     Args:
-        controls: none.
         sizes: the number of goals of each kind of graph, in the order of tasks.
     """
     returns = _parts(run.own_returns, sizes)
@@ -76,7 +75,6 @@ def above_random_search(run: Evidence, controls: Sequence[Evidence], sizes: Sequ
     The search acts at random until it finds the goal of a block, and keeps it.
 
     Args:
-        controls: none.
         sizes: the number of goals of each depth, in the order of tasks.
     """
     returns = _parts(run.own_returns, sizes)
@@ -179,7 +177,6 @@ def measure(run: Evidence, controls: Sequence[Evidence], prop: Any) -> Measured:
 
     Args:
         controls: the runs of the property's controls, of the same agent and seed.
-        prop: one of `curricula.profile.PROPERTIES`.
 
     Raises:
         Undefined: where the run has no value.

@@ -160,7 +160,6 @@ def profile_scores(paths: Sequence[Path | str], agents: Sequence[str] = ()) -> d
 
     Args:
         paths: folders of runs, of ``ctgraph-rl profile`` or of a `ctgraph_rl.Recorder`.
-        agents: names and order of agents, as for `ctgraph_rl.report.names.displayed`.
 
     Returns:
         For each agent its score by the title of each property. A modified curriculum counts where the published one has

@@ -31,7 +31,6 @@ class BoundsOfRuns:
 
     Args:
         returns: of an evaluation of each task, by its label.
-        known: what the metrics' bounds follow from.
         of_training: of the mean return of any number of episodes.
         one_episode: whether all episodes of an evaluation are equal: greedy ones of tasks without chance.
     """

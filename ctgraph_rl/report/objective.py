@@ -17,7 +17,6 @@ def check_objective(name: str | None, experts: bool, until: float | None) -> Non
 
     Args:
         name: of a metric; None: no objective.
-        experts: whether the run has experts.
         until: the share of the frames that a tuning run learns; None: the run is none.
 
     Raises:

@@ -103,7 +103,6 @@ def write_report(
         width: of figures: ``text`` of a page, or one of two columns, ``column``.
         colours: of agents, each as ``NAME=COLOUR``.
         count: called after each run, agent and figure.
-        tuning: show tuning runs, too.
 
     Raises:
         ModuleNotFoundError: before any work, without what the extra ``report`` installs.

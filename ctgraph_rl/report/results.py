@@ -68,9 +68,6 @@ class Row:
     Args:
         agent: its class or name, with the settings that distinguish it; or a directory.
         measure: a metric, a measure of how tasks ended, or ``solved`` and a task.
-        estimate: over seeds.
-        definition: id of the metric's definition.
-        note: why seeds have no value.
         seed: of one run; None for all seeds.
         columns: measures that tables show of its agent on its curriculum.
     """
@@ -102,7 +99,6 @@ def table(runs: Sequence[Run], statistics: str = "exact", count: Count = silent)
     """Return every metric, and how tasks ended, for each agent on each curriculum.
 
     Args:
-        runs: finished or not.
         statistics: one of `ctgraph_rl.parsers.STATISTICS`.
         count: called after each agent on a curriculum.
 
@@ -173,7 +169,6 @@ def selected(rows: Sequence[Row], names: Sequence[str] | None = None, also: Sequ
     Args:
         names: of measures, ``solved`` for all tasks' shares; None: the rows' columns, and those of `WHERE_KNOWN` with
             a value.
-        also: further measures.
 
     Raises:
         ValueError: for a name that no row has.

@@ -43,11 +43,7 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True)
 class Result:
-    """The runs of an agent on a curriculum.
-
-    Args:
-        bounds: of what they measure.
-    """
+    """The runs of an agent on a curriculum."""
 
     agent: str
     by_seed: BySeed
@@ -175,16 +171,7 @@ def mean_curve(history: History) -> Curve:
 def training_curve(
     runs: Iterable[Run], block: int, *, start: int, end: int, places: int, bounds: Bounds = UNBOUNDED
 ) -> list[Point]:
-    """Return while training in a block: means over equal spans of frames in which every run has a value.
-
-    Args:
-        runs: of one agent.
-        block: from 1.
-        start: frames before it.
-        end: frames at its end.
-        places: number of spans.
-        bounds: of a return.
-    """
+    """Return while training in a block: means over equal spans of frames in which every run has a value."""
     width = max((end - start) / places, 1)
     curves = []
     for history in histories(runs):

@@ -1,9 +1,8 @@
 """Statistics over seeds: what n runs of one agent say, and what they leave open.
 
-There is one rule for each kind of number; ``docs/explanation/statistics.md`` has their coverage by simulation:
+``docs/explanation/statistics.md`` has the coverage of these intervals by simulation:
 
-- A share, and a mean of values with known bounds: Gaffke's interval. It assumes no distribution, stays within the
-  bounds, and is that of Clopper and Pearson for two outcomes at the bounds.
+- A share, and a mean of values with known bounds: Gaffke's interval, that of Clopper and Pearson for two outcomes.
 - A mean of values without two known bounds: Student's interval, cut at a known bound.
 - A time: the interval of the median by order statistics, where a seed that never got there took infinitely long.
 
@@ -132,7 +131,6 @@ def mean(values: Values, level: float = LEVEL, bounds: LowHigh = UNBOUNDED) -> E
 
     Args:
         values: one per seed; None or NaN for a seed without.
-        level: coverage of the interval.
         bounds: lowest and highest value of a seed (`Bounds`); a value outside makes them none.
     """
     require(*fraction(level=level))
@@ -199,7 +197,6 @@ def iqm(values: Sequence[Values], level: float = LEVEL, resamples: int = RESAMPL
 
     Args:
         values: for each task, one value per seed; None or NaN for a seed without.
-        level: coverage of the interval.
     """
     stats = scipy("stats")
     known, n, undefined = _of_tasks(values, "iqm", level, resamples)
@@ -235,7 +232,6 @@ def solved_rate(solved: Sequence[bool | None], level: float = LEVEL) -> Estimate
 
     Args:
         solved: one per seed; None for a seed without result.
-        level: coverage of the interval.
     """
     require(*fraction(level=level))
     known = [float(each) for each in solved if each is not None]
@@ -255,7 +251,6 @@ def median_time(times: Values, level: float = LEVEL) -> Estimate:
 
     Args:
         times: one per seed, >= 0; infinite for a seed that never got there, None or NaN for one without result.
-        level: coverage of the interval.
     """
     require(*fraction(level=level))
     known, missing = _known(times)
@@ -294,8 +289,6 @@ def interquartile_mean(
 
     Args:
         values: for each task, one value per seed; None or NaN for a seed without.
-        level: coverage of the interval.
-        bounds: the lowest and highest possible value.
     """
     known, n, undefined = _of_tasks(values, "interquartile_mean", level, resamples)
     lowest, highest = _checked(bounds)
@@ -325,8 +318,6 @@ def compare(first: Values, second: Values, level: float = LEVEL, bounds: LowHigh
     Args:
         first: one value per seed.
         second: the other agent's on the same seeds and curriculum, in the same order.
-        level: coverage of the interval.
-        bounds: the lowest and highest possible value.
 
     Raises:
         ValueError: for different numbers of seeds.

@@ -32,7 +32,6 @@ def require_packages(what: str = "the report", *names: str) -> None:
     """Refuse before any work.
 
     Args:
-        what: needs packages.
         names: of packages that the extra ``report`` installs; default: all.
 
     Raises:
@@ -57,7 +56,6 @@ def style(width: str = "text", colours: Mapping[str, str] | None = None) -> Iter
     """Give figures that are made and saved within it the report's style.
 
     Args:
-        width: one of `WIDTHS`.
         colours: of agents, by their names in figures; others have the style's.
 
     Raises:
@@ -101,7 +99,6 @@ def panels(count: int, most: int, height: float, width: float = 1, room: float =
     """Return the axes of a new figure, in rows of up to ``most``; spare ones stay empty.
 
     Args:
-        count: how many are needed.
         most: in a row of a page's text.
         height: of a row, in inches.
         width: share of a whole figure's.
@@ -147,7 +144,6 @@ def contrast(one: Sequence[float], other: Sequence[float]) -> float:
 
     Args:
         one: red, green and blue of sRGB, each in [0, 1].
-        other: likewise.
     """
     dark, light = sorted((_luminance(one), _luminance(other)))
     return (light + 0.05) / (dark + 0.05)

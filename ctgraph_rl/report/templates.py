@@ -13,7 +13,6 @@ def rendered(template: Path, **values: Any) -> str:
 
     Args:
         template: its file, ``NAME.html.j2`` or ``NAME.md.j2``.
-        values: by the names that it uses.
     """
     from jinja2 import FileSystemLoader, StrictUndefined
     from jinja2.sandbox import SandboxedEnvironment

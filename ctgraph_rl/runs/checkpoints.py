@@ -67,10 +67,6 @@ class Checkpoints:
         """Save if it is time, called after every update.
 
         The first one is saved at once, so that a full disk or an unreadable state stops a run early.
-
-        Args:
-            state: makes what is saved.
-            at_block_end: always save.
         """
         offer_all([self], lambda: [state()], at_block_end)
 

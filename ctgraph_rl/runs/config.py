@@ -114,12 +114,7 @@ def name_of(cfg: DictConfig, choices: Any) -> str:
 
 
 def of_seed(cfg: DictConfig, seed: int, run_dir: Path) -> tuple[DictConfig, Path]:
-    """Return the configuration and directory of one seed of a job.
-
-    Args:
-        cfg: the configuration of the job, with its first seed.
-        run_dir: the directory of the first seed.
-    """
+    """Return the configuration and directory of one seed of a job."""
     choices = HydraConfig.get().runtime.choices
     folder = run_dir.parents[len(Path(name_of(cfg, choices)).parts) - 1]
     own = deepcopy(cfg)
@@ -133,8 +128,6 @@ def of_member(cfg: DictConfig, number: int, settings: ReadOnlyValues) -> DictCon
     """Return the configuration of a collective's member: its seed, and its curriculum if they differ.
 
     Args:
-        cfg: the configuration of the collective.
-        number: the member, from 0.
         settings: only this member's, such as ``{"agent.learning_rate": 0.01}``.
 
     Raises:

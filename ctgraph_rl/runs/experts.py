@@ -103,14 +103,11 @@ def find_or_train(
     Experts of one task that have not begun are trained as one batch.
 
     Args:
-        curriculum: has the tasks.
-        learn: trains the experts of a task, or resumes their training.
         folder: of experts, each under a hash of its curriculum's fingerprint and settings.
         settings: by seed, all else that experts' numbers depend on: agent, seed, versions.
         tell: takes a line about each expert.
         waiting: called every half second while another process trains one.
         only: the one task, from 1, whose experts are needed; None: all.
-        console: where progress shows; default: standard error.
 
     Returns:
         Experts by seed, and the error of each seed with a failed expert, which has none.

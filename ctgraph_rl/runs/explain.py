@@ -51,12 +51,7 @@ _NO_SETTINGS = {"_target_", "hydra"}
 
 
 def explain(error: BaseException, cfg: DictConfig | None = None) -> str:
-    """Return one message for a user's error: its cause within Hydra's errors, and the likely name.
-
-    Args:
-        error: what was raised.
-        cfg: the run's configuration, if there was one.
-    """
+    """Return one message for a user's error: its cause within Hydra's errors, and the likely name."""
     cause = error
     while cause.__cause__ is not None and not _says_what_to_do(cause):
         cause = cause.__cause__

@@ -167,8 +167,6 @@ def train_experts(
     """Find or train the single-task experts of several seeds' runs, those of a task as one batch.
 
     Args:
-        configs: of each seed.
-        curriculum: of their runs.
         interrupt: ends waiting for other processes.
         only: the one task whose experts are needed, from 1; None: all.
 
@@ -243,7 +241,6 @@ def make_agent(
 
     Args:
         name: of a file in ``conf/agent``, such as ``"ppo"``.
-        curriculum: what the agent will learn.
         seed: decides the weights and torch's global generator, in [0, 2**63); None: as on the command line.
         method: of a file in ``conf/method``, such as ``"ewc"``; None: as on the command line.
         method_settings: replace those of the method's file, such as ``{"coeff": 50.0}``.
@@ -354,10 +351,7 @@ def learn(
     """Build runs that differ in their seeds, and let them learn in their locked directories.
 
     Args:
-        session: has the locks.
         cells: one, or all of a batch.
-        interrupt: for checkpoints.
-        built: the objects of one, if built.
         together: learn as one batch, of one seed, too.
 
     Returns:

@@ -24,9 +24,6 @@ class DaskCell:
 
     Args:
         hydra_context: composes the cell's configuration.
-        task_function: runs it.
-        config: of the sweep.
-        overrides: the cell's settings.
         number: of the cell in its sweep.
     """
 
@@ -64,7 +61,6 @@ def run_cell(packed: tuple[str, list[str], bytes], wait: float) -> JobReturn:
     That may be the child of a killed worker or driver.
 
     Args:
-        packed: by `DaskCell.pack`.
         wait: seconds between two tries.
 
     Raises:

@@ -77,7 +77,6 @@ class Recorder:
             in one folder that name no learner are one learner, with the folder's name.
         code: classes and functions that learn; the log records their source, so that results of changed code are not
             averaged with earlier ones.
-        overwrite: replace the directory's run.
         resume: resume the directory's run from its last `checkpoint`, or from the start without one. ``saved`` is what
             was saved, and ``frames`` after how many frames. A finished run is shown: ``finished`` is true, ``frames``
             is the curriculum's, so that nothing is learned again, ``log`` and ``metrics`` hold its results, `evaluate`

@@ -64,14 +64,11 @@ class RunMember(Member):
     """A learner and its run's directory. Its log is in memory until `begin`.
 
     Args:
-        run_dir: an existing directory.
         config: settings in the log's first line, with the seed, as JSON.
-        checkpoints: the directory's.
         sources: classes and functions that learn, for `provenance`, if known.
         together: the seeds of its batch; none for a single run.
         experts: each task's single-task expert, named in the log.
         save_optimiser: whether the weights at the end come with the optimiser's moments.
-        listeners: called with every measurement.
     """
 
     run_dir: Path

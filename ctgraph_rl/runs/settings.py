@@ -249,7 +249,6 @@ def as_typed(message: str, settings: ReadOnlyValues, typed: Iterable[str]) -> st
 
     Args:
         message: of objects that do not know their setting.
-        settings: all settings of the run.
         typed: full names of given ones, which decide between equal last parts.
     """
     homes: dict[str, list[str]] = {}

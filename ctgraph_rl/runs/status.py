@@ -89,7 +89,6 @@ def status_of(folder: Path, before: RunOutcome = NOTHING, error: str | None = No
     Args:
         folder: the directory; need not exist.
         before: results and failures from before the sweep, which do not count.
-        error: what it raised, if known.
     """
     now = RunOutcome.of(folder)
     if now.results not in (None, before.results) and is_complete(folder):
@@ -137,8 +136,6 @@ def report(statuses: Mapping[str, Status], repeated: int = 0, most: int | None =
     """Report the number of cells by state, and why some are not done.
 
     Args:
-        statuses: each cell by its settings.
-        repeated: duplicate cells, left out.
         most: named cells; None: all.
     """
     counts = Counter(found.state for found in statuses.values())
@@ -164,7 +161,6 @@ class SweepProgress(TextBar):
 
     Args:
         cells: run directories, each with the outcome before the sweep, as `status_of`.
-        console: where it shows.
     """
 
     def __init__(self, cells: Mapping[Path, RunOutcome], console: Console | None = None) -> None:
@@ -218,11 +214,7 @@ class SweepProgress(TextBar):
         """Return one line: cells done (also before), failed and running, rate and time left.
 
         Args:
-            done: also before.
-            failed: cells that failed.
-            running: cells that run.
             ended: done or failed in ``seconds``.
-            seconds: time of this start.
         """
         rate = ended / seconds
         left = (self.total - done - failed) / rate if rate else math.inf

@@ -71,7 +71,6 @@ class Sweeper(Base):
 
     Args:
         max_batch_size: cells given to the launcher at a time; None: all.
-        params: what is swept, beside the command line.
         status: only report the status of each cell.
         variants: settings that change together, each combined with all of ``params``.
     """

@@ -50,7 +50,6 @@ class Tracker:
     Args:
         make_logger: builds the logger of an empty folder.
         run_dir: the folder there is replaced, as a resumed run sends all measurements again.
-        hyperparameters: the settings that the logger records.
 
     Raises:
         ModuleNotFoundError: if the logger's package is missing; names the extra to install.

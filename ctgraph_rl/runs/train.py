@@ -132,14 +132,11 @@ def train(
 
     Args:
         agent: just built by `new_agent`, which decides torch's global generator.
-        run_dir: must exist.
         seed: in [0, 2**63).
-        device: of environment and agent.
         config: for the log's first line beside the seed, as JSON.
         experts: each task's single-task expert, named in the log.
         checkpoints: default: in the directory, every five minutes.
         listeners: called with every measurement.
-        console: where progress shows; default: standard error.
 
     Raises:
         ValueError: before any work, for arguments out of range, an agent that cannot learn the curriculum, and a run

@@ -84,9 +84,6 @@ class Life(Sequence[Block]):
 
     Args:
         choices: the tasks from which all but the image set is drawn.
-        num_tasks: blocks, at most `MOST_STREAMED`.
-        num_frames: of each block.
-        order: one of `ORDERS`.
         image_seeds: the image sets to draw from; none: a new set each time.
         share: of ``returning`` blocks, in (0, 1].
         lag: blocks between a task and its return.

@@ -66,7 +66,6 @@ def read_paper_json(source: str, content: ReadOnlyValues, goal: Goal | None) -> 
     states, which Table 3 leaves out, come last.
 
     Args:
-        source: the file, for messages.
         goal: d decisions in 1..b, such as ``"1.2"``.
 
     Raises:

@@ -1,15 +1,13 @@
 """Exact values of policies by backward induction, the ceiling of those without memory, and random episodes.
 
-The tree has no cycles but the waiting in place, so values follow from the end states back to home in one pass. With
-reward r_(t+1) for step t (the first step has t = 0) a return is sum_t gamma^t r_(t+1); every episode ends, so gamma
-may be 1. A wait state is left with probability 1 - p per wait; with V' the value of where it leads,
+With reward r_(t+1) for step t (the first step has t = 0) a return is sum_t gamma^t r_(t+1); every episode ends, so
+gamma may be 1. A wait state is left with probability 1 - p per wait; with V' the value of where it leads,
 
     V(wait) = s + a (1 - p) V' + a p gamma V(wait) + (1 - a) fail_reward    if it waits with probability a,
 
-which is solved for V(wait). Rewards are those of `CTGraphEnv`, here in float64: ``goal_reward`` times the share of
-``reward_fn`` on entering an end state, ``fail_reward`` on entering the fail state, and s = ``step_reward`` for every
-step, one more after an end state with ``extra_end_step``. Noise has mean 0 and changes nothing; a goal that changes
-stays. Policies see observation ids, which equal images where no two are alike and nothing varies on read.
+which is solved for V(wait). Rewards are those of `CTGraphEnv`, here in float64; s = ``step_reward`` for every step, one
+more after an end state with ``extra_end_step``. Noise has mean 0 and changes nothing; a goal that changes stays.
+Policies see observation ids, which equal images where no two are alike and nothing varies on read.
 """
 
 from __future__ import annotations

@@ -91,9 +91,6 @@ class SelfLabelled:
     def attach(self, agent: Agent, curriculum: Curriculum) -> SelfLabelledAgent:
         """Return the agent with the method, whose tasks the detector labels.
 
-        Args:
-            curriculum: from `prepare`.
-
         Raises:
             ValueError: if agent, method and detector do not fit together.
         """
@@ -136,10 +133,6 @@ class SelfLabelledAgent(nn.Module):
     labels start in the order of their opening, for `Judge.patience` frames each, without learning. If the detector
     accepts none, a new label starts, or the old one resumes if there are `max_labels`. If it accepts the old label,
     there was no boundary, and the snapshot stays.
-
-    Args:
-        learner: the agent with its method.
-        policy: of the agent, which computes features.
     """
 
     events = ("alarm", "rolled_back")

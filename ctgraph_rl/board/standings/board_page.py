@@ -44,7 +44,6 @@ def write_board(
     """Write the page and the other files of a board.
 
     Args:
-        paths: folders of submissions, or folders that hold them.
         config_dir: where the user's tracks are, as ``track/NAME.yaml``.
 
     Raises:

@@ -26,7 +26,6 @@ class Standing:
     """A line of a table.
 
     Args:
-        entry: what stands there.
         name: of the method, unique in the table.
         estimates: of the score and the other measures, over seeds.
         best_rank: that the comparisons leave open; None without rank.
@@ -57,7 +56,6 @@ class BoardTable:
     """Comparable entries, the best score first.
 
     Args:
-        variant: what all learned.
         pairs: comparisons of the scores of every two ranked entries, by name.
     """
 

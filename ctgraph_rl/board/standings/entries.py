@@ -48,13 +48,8 @@ class BoardEntry:
     """A submission on the board.
 
     Args:
-        digest: of the submission.
         method: from ``method.yaml``.
-        track: that it is for.
-        variant: what it learned.
-        verification: how far it was verified.
         values: of the track's score and `board_columns`, one for each seed, or None.
-        failed: why seeds failed.
         agent_bytes: of the largest agent, if a run left one.
     """
 
@@ -118,7 +113,6 @@ def read_entries(paths: Iterable[Path | str], config_dir: Path | None = None) ->
     """Return the submissions in or below folders, and what is left out.
 
     Args:
-        paths: folders of submissions, or folders that hold them.
         config_dir: where the user's tracks are, as ``track/NAME.yaml``.
     """
     found: dict[str, BoardEntry] = {}

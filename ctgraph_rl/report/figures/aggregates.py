@@ -55,7 +55,6 @@ def performance_profile(of_tasks: Scores, thresholds: np.ndarray, seed: int = 0)
     """Return the share of runs and tasks with a score above each threshold, float64 [thresholds], with its interval.
 
     Args:
-        of_tasks: an agent's scores.
         thresholds: float64 [thresholds].
     """
     rng = np.random.default_rng(seed)
@@ -74,10 +73,6 @@ def probability_of_improvement(first: Scores, second: Scores, seed: int = 0) -> 
     """Return the probability that a run of one agent is better than one of another, the mean over shared tasks.
 
     It is the statistic of Mann and Whitney over the number of pairs of seeds; equal scores count half.
-
-    Args:
-        first: scores of the agent that may be better.
-        second: scores of the other.
     """
     rng = np.random.default_rng(seed)
     tasks = [task for task in first if task in second]

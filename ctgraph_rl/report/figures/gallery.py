@@ -41,13 +41,7 @@ def left_out(count: int, most: int, what: str) -> str:
 
 
 class Gallery:
-    """Writes figures into a report's folder, with unique names.
-
-    Args:
-        width: as for `style`.
-        colours: as for `style`.
-        count: takes how many figures are done.
-    """
+    """Writes figures into a report's folder, with unique names."""
 
     def __init__(
         self,

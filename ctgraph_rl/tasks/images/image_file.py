@@ -25,7 +25,6 @@ class ImageFile:
     classes * instances * (read_rotation + 1) * r * r bytes.
 
     Args:
-        path: the file; relative to the working directory.
         sha256: of the file, 64 hex digits.
         size: side of an observation in pixels: a multiple of r repeats pixels, a divisor averages blocks; None: r.
 

@@ -94,7 +94,6 @@ def by_name(what: str, arguments: Any) -> tuple[tuple[str, Any], ...]:
 
     Args:
         what: has the arguments; begins the message.
-        arguments: a mapping, or pairs.
 
     Raises:
         ValueError: for anything else, and values that JSON has no form for.
