@@ -22,6 +22,7 @@ from ctgraph_rl.parsers import BOUND
 from ctgraph_rl.runs.settings import ADDED, as_before, flat
 
 EQUAL, DIFFERENT, ROUNDING = 0, 1, 3
+"""Exit codes."""
 
 TOGETHER = "seeds trained together"
 EXPERTS_TOGETHER = "seeds of experts trained together"

@@ -41,6 +41,7 @@ ROWS = 256
 """Environments that evaluations within blocks must fit."""
 
 MOST_EVALUATED = 20
+"""Most tasks with evaluations within blocks."""
 
 TRIALS = 50
 

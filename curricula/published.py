@@ -16,6 +16,7 @@ from ctgraph_rl.tasks.task import Task
 from curricula.axes import Tasks, sequence
 
 NamedTasks = list[tuple[int, str]]
+"""Tasks as image seed and path."""
 
 GoalPool = Sequence[tuple[int, int]]
 """(image seed, depth) of each environment, whose goals are numbered in turn."""
@@ -205,3 +206,4 @@ MISSING = (
         "they were drawn again in every generation; penn_a_swap draws by the same rule from another seed",
     ),
 )
+"""Sequences that cannot be recovered, and why."""

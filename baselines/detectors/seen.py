@@ -33,5 +33,7 @@ class Suspicion(Enum):
 
 
 SUSPICION = Suspicion.CHANGE
+"""The answer that the task has changed to an unknown one."""
 
 Verdict = int | Literal[Suspicion.CHANGE] | None
+"""A label, `SUSPICION`, or None where nothing speaks against the present label."""

@@ -170,6 +170,7 @@ class TaskMethod(Method):
     agent_members = (*Method.agent_members, "weights_changed")
 
     counts: ClassVar[tuple[str, ...]] = ()
+    """Attributes that are changing numbers and are saved."""
 
     def __init__(self) -> None:
         super().__init__()

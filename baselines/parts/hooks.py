@@ -64,6 +64,8 @@ class PlasticityHooks(nn.Module):
     """Whether it acts on gradient steps by `penalties` only, which several seeds can share."""
 
     needs_starts: bool = False
+    """Whether `start_task` does anything."""
+
     recycles: bool = False
     """Whether it writes weights other than by the optimiser, which methods that fix weights refuse."""
 

@@ -43,10 +43,13 @@ class Learner(TakesNumbers, Trained):
     seeds can take turns. A subclass that overrides what seeds share, such as `learn`, must set it again."""
 
     needs_episodes: ClassVar[bool] = False
+    """Whether it needs data that say where episodes end."""
+
     solves: ClassVar[str]
     """Which tasks it can solve in principle, in a few words."""
 
     output_keys: ClassVar[tuple[str, ...]]
+    """The keys of `outputs` that the network computes."""
 
     def __init__(self, num_envs: int, num_steps: int, max_grad_norm: float, compile: bool = False) -> None:
         super().__init__()

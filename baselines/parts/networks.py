@@ -24,10 +24,13 @@ from ctgraph_rl.learn.guide import GUIDED_ACTION
 from ctgraph_rl.learn.histories import can_branch, distinct, renumber
 
 Data = Mapping[Any, Tensor]
+"""Tensors by key, in a dictionary or a TensorDict."""
 
 Items = dict[Any, Tensor]
+"""Tensors by key, whose first dimension is a batch's."""
 
 TensorsByName = dict[str, Tensor]
+"""Such as losses, outputs and weights."""
 
 INPUT = "input_number"
 """Key of frames' numbers, int64, the same for the same inputs."""

@@ -26,6 +26,8 @@ class Trained(nn.Module):
     max_grad_norm: float
 
     minibatch_size: int
+    """Items of a minibatch, unless a block's end shortened the batch."""
+
     capturable: ClassVar[bool] = False
     """Whether a gradient step has no branch on data and keeps no new tensors, as CUDA graphs need."""
 

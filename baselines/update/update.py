@@ -52,12 +52,16 @@ class UpdateState(NamedTuple):
     """What an update reads and writes in place: tensors of one learner, or of several seeds."""
 
     weights: Sequence[Tensor]
+    """By which the losses are differentiated."""
+
     optimiser: Parts | torch.optim.Optimizer
 
     tensors: Mapping[str, Tensor] | None = None
     """Of several seeds, all parameters and buffers by name, [seeds, ...] each; None: the learner's."""
 
     names: Sequence[str] = ()
+    """Names of the weights among these tensors."""
+
     turned: Sequence[str] = ()
     """Names of matrices kept as [seeds, inputs, outputs], as the backward pass returns their gradients."""
 

@@ -18,6 +18,7 @@ from ctgraph_rl.core.rewards import KERNEL_REWARDS, RewardFn
 from ctgraph_rl.core.row_params import RowParams
 
 KERNELS = ("auto", "off", "required")
+"""The values of ``kernel`` of `Rows`."""
 
 
 def kernel_rule(kernel: object) -> Rule:
@@ -64,6 +65,7 @@ class Stepped(NamedTuple):
 
 
 Observed = tuple[Tensor, Tensor | None]
+"""What rows observe, uint8 [N, *shape], and which are done, bool [N]; None if none is."""
 
 
 class Native:

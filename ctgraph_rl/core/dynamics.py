@@ -62,6 +62,7 @@ class Shown(NamedTuple):
 
 
 StateAndShown = tuple[RowState, Shown]
+"""The next states, and what they show."""
 
 Batch = TypeVar("Batch", RowState, Shown)
 

@@ -98,3 +98,4 @@ KERNEL_REWARDS = (Needle, Gradient, ReferenceLinear)
 """Rewards that ``kernel.c`` computes, in its order; others need the tensor engine."""
 
 REWARD_FNS: dict[str, type] = {"needle": Needle, "gradient": Gradient, "reference_linear": ReferenceLinear}
+"""Every reward of this package by its name in settings."""

@@ -26,6 +26,7 @@ from ctgraph_rl.tasks.task import ct_graphs
 
 MOST_PANELS = 12
 MOST_LEVEL = 4
+
 COLUMNS = 3
 
 

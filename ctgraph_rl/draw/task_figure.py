@@ -32,8 +32,10 @@ PerAction = Mapping[Any, Any]
 ROOM, ROOM_FOR_NUMBERS = 30.0, 50.0
 """Points between end states from which actions, loops and ways to fail are drawn, and numbers at them."""
 MOST_WAIT_LEVELS = 6
+
 LARGEST_MARK = 24.0
 LEGEND_WIDTH = 5.5
+
 SMALLEST_TEXT = 4.0
 INITIALS = {kind: kind.name[0] for kind in StateType}
 GREY = "0.65"

@@ -43,6 +43,7 @@ class ExchangeLike(Protocol):
     drop_prob: float
     delay_prob: float
     kinds: Sequence[str]
+    """The kinds of messages in the order in which they are sent within an exchange."""
 
     def settings_of(self, member: int) -> ReadOnlyValues:
         """Return this member's special settings, such as ``{"agent.learning_rate": 0.01}``."""

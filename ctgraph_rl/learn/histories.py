@@ -98,6 +98,8 @@ class Tree(NamedTuple):
     """What each continues: its place among the states of `initial`, followed by the histories; int64."""
 
     sizes: list[int]
+    """Histories of each length."""
+
     of_frames: Tensor
     """The history of each frame, int64 [rows * steps]."""
 

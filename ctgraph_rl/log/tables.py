@@ -49,6 +49,7 @@ EVALUATIONS = {
     **EPISODES,
     **SECONDS,
 }
+"""Columns: type and meaning."""
 
 TRAINING = {
     **RUN,

@@ -22,13 +22,16 @@ from ctgraph_rl.metrics.regimes import Column, Regime, RegimeTable
 from ctgraph_rl.metrics.transfer import check_experts, mean_area, stage_areas, trapezoid_area
 
 SUMMARY = (average_performance, forward_transfer, backward_transfer, forgetting)
+"""The metrics that every run shows."""
 
 ORDER = ("matrix", "curves", "optimum", "ceilings", "lifetime", "transfer")
+"""Modules as listed; other modules follow."""
 
 for _found in iter_modules(__path__):
     import_module(f"{__name__}.{_found.name}")
 
 NamedMetrics = dict[str, Metric]
+"""Metrics by name."""
 
 
 def of_inputs(given: Mapping[str, Any]) -> NamedMetrics:

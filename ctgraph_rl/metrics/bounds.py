@@ -25,6 +25,7 @@ class Known(NamedTuple):
 
 LowAndHigh = tuple[float, float]
 BoundsOf = Callable[[Known], LowAndHigh]
+"""A metric's bounds; infinite if there are none."""
 
 
 def unbounded(known: Known) -> LowAndHigh:

@@ -22,6 +22,7 @@ HUBERT = "Hubert & Arabie 1985, Comparing partitions (Journal of Classification 
 SEVERAL = -1
 
 PER = 100_000
+"""Frames per which alarms are counted."""
 
 
 class Labelling(NamedTuple):

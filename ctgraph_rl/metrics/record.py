@@ -71,7 +71,11 @@ class Entry(NamedTuple):
     inputs: dict[str, str]
     """Names in `INPUTS` by argument."""
     required: tuple[str, ...]
+    """Inputs without which there is no metric."""
+
     bounds: BoundsOf = unbounded
+    """Lowest and highest value of a run."""
+
     is_time: bool = False
     """Whether it is a time, infinite in a run that never got there."""
     is_exact: bool = False
@@ -85,6 +89,7 @@ class Entry(NamedTuple):
 
 
 METRICS: dict[str, Entry] = {}
+"""Every metric by its function's name."""
 
 
 class Undefined(Exception):

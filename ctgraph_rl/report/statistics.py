@@ -32,12 +32,14 @@ RESAMPLES = 10_000
 BATCH = 1000
 
 MOST_FLIPPED = 16
+"""Pairs up to which all flips of signs are tried."""
 
 ROUNDING = 1e-12
 
 EQUAL_SEEDS = "all seeds are equal; few seeds leave other means possible, and the interval shows which"
 
 MOST_SEEDS = 2**20
+"""Seeds at which `seeds_needed` gives up."""
 
 
 Values = Sequence[float | None]

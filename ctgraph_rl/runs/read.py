@@ -50,6 +50,7 @@ MEASURES = {
     "adaptation": ("adaptation_", ("return_mean", "success_rate", "found_rate", "exact_rate")),
     "training": ("training_", ("return_mean", "success_rate")),
 }
+"""By kind of measurement: the beginning of values' names, and the fields."""
 
 MOST_SEEDS = 10
 
@@ -57,8 +58,10 @@ MOST_MODULES = 3
 """Differing modules that are named; one digest stands for the others."""
 
 CurriculumKey = tuple[str, str]
+"""A curriculum's name and fingerprint."""
 
 AgentKey = tuple[str, str]
+"""Curriculum and agent, as tables name them."""
 
 Curve = list[tuple[int, float]]
 """Mean returns by frames, or NaN."""
@@ -81,6 +84,7 @@ NOWHERE = (None,) * 6
 
 
 UNIT_METRICS = {"dead": "dead units", "dormant_0.1": "dormant units (0.1)", "rank_effective": "effective rank"}
+"""Metrics of hidden units in figures, with their names."""
 
 
 class History(NamedTuple):

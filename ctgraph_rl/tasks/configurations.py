@@ -21,6 +21,7 @@ from ctgraph_rl.tasks.paper_json import shown_ids
 from ctgraph_rl.tasks.task import Task
 
 OBSERVABILITY = ("full", "decisions", "surjective", "confounding")
+"""How much of its state a task shows, as in `observations_of`."""
 
 
 @takes_numbers

@@ -16,10 +16,12 @@ from ctgraph_rl.core.rewards import Needle
 from ctgraph_rl.tasks.task import Task
 
 POLICIES = ("random", "navigation", "optimal")
+"""The policies of section 2.2 of the paper."""
 
 PLACED = (StateType.WAIT, StateType.DECISION, StateType.END)
 
 VisitsByLevel = dict[StateType, dict[int, float]]
+"""Expected visits by kind and level."""
 
 
 def states_per_observation(task: Task) -> dict[str, int]:

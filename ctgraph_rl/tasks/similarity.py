@@ -30,6 +30,7 @@ ROUNDING = 1e-9
 """Actions are equally good within this difference, relative to the task's largest value."""
 
 MAX_COMPARED_BYTES = 2**31
+"""Largest image set that is compared."""
 
 CHOOSING = (StateType.WAIT, StateType.DECISION)
 

@@ -112,6 +112,7 @@ class Drift(_ForEpisodes):
 
 
 SWITCHES = (ByEpisode, AtRandom, Drift)
+"""Every switch of this package."""
 
 
 def switch_rule(switch: object) -> Rule:
