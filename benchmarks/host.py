@@ -33,7 +33,7 @@ from ctgraph_rl.runs import config, job, session
 SMALL = ("agent.num_envs=32", "curriculum.num_frames=1024", "together=true", "checkpoint_seconds=1e9")
 """One batch a block; the host's work does not depend on its size but for `log`."""
 
-PARTS = {
+PARTS: dict[str, tuple[list[tuple[Any, str]], int, int]] = {
     "build": ([(job, "build"), (job, "prepare")], 1, 1),
     "begin": ([(session.RunMember, "begin")], 1, 1),
     "weights to the agents": ([(Stack, "write")], 5, 5),

@@ -170,7 +170,7 @@ class CapturedGroup(SeedGroup):
     policy.capturable = True  # type: ignore[attr-defined]
 
     @property
-    def greedy_policy(self) -> Policy | None:
+    def greedy_policy(self) -> Policy | None:  # type: ignore[override]
         """Acts as `policy`, with the most likely actions; None with a method, whose policy depends on the task."""
         return None if self.methods else self._act_greedily
 

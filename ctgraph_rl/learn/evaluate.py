@@ -369,7 +369,8 @@ def evaluate_together(
         for evaluator, agent in zip(evaluators, agents, strict=True):
             own = task_policies(agent, curriculum, evaluator.log, tasks, frames)
             policies.append(_join_policies(agent, own))
-        policy = InTurn(policies, seeds)
+        policy = InTurn(policies, seeds)  # type: ignore[assignment]  # acts on tensors
+    assert policy is not None
     env = first.make_shared_env(tasks, len(evaluators))
     streams = torch.tensor(seeds, device=env.device).repeat_interleave(count)
     env.rows.set_streams(streams, torch.arange(count, device=env.device).repeat(len(evaluators)))

@@ -111,7 +111,7 @@ def weights_of(agent: Agent) -> list[Tensor]:
 
 
 def _norm(tensors: Sequence[Tensor]) -> float:
-    return torch.stack(torch._foreach_norm(tensors)).norm().item()
+    return torch.stack(torch._foreach_norm(list(tensors))).norm().item()
 
 
 def task_images(task: Task, shape: tuple[int, ...]) -> Tensor:
