@@ -17,6 +17,12 @@ from ctgraph_rl.learn.exact import exact_rules
 from ctgraph_rl.tasks.curriculum import Curriculum, Stream
 from ctgraph_rl.tasks.task import Task
 
+MANY_TASKS = 10_000
+"""Tasks above which a run says what they take."""
+
+SECONDS_OF_A_TASK = 4e-4
+"""To make a task, its fingerprint and its JSON, on one core."""
+
 
 def check_rows(curriculum: Curriculum, num_envs: int) -> None:
     """Refuse a curriculum whose blocks are not whole steps of ``num_envs`` rows.
@@ -140,6 +146,10 @@ def check_adaptation(curriculum: Curriculum, agent: Agent) -> None:
 
 def notes(curriculum: Curriculum, agent: Agent) -> Iterator[str]:
     """Yield what to know of a curriculum, and of an agent on it, before a run."""
+    count = len(curriculum.tasks)
+    if count > MANY_TASKS and not isinstance(curriculum, Stream):
+        time = f"{count:,} tasks take about {count * SECONDS_OF_A_TASK:.0f} s to make and to write"
+        yield f"{time}, besides learning and evaluations: curriculum.goals=random takes fewer"
     method = getattr(agent, "method", None)
     kept = getattr(method, "bytes_per_task", 0)
     if kept and isinstance(curriculum, Stream):

@@ -23,7 +23,7 @@ from hydra.core.utils import JobRuntime
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from hydra.version import VersionBase
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.basecontainer import BaseContainer
 from omegaconf.errors import OmegaConfBaseException
 
@@ -114,13 +114,20 @@ def name_of(cfg: DictConfig, choices: Any) -> str:
 
 
 def of_seed(cfg: DictConfig, seed: int, run_dir: Path) -> tuple[DictConfig, Path]:
+<<<<<<< HEAD
     """Return the configuration and directory of one seed of a job."""
+=======
+    """Return the configuration and directory of one seed of a job.
+
+    Args:
+        cfg: the configuration of the job, with its first seed and without ``seeds``.
+        run_dir: the directory of the first seed.
+    """
+>>>>>>> 60e71c01 (A log's messages are made where they are needed; a group's cells copy no list of seeds; a run says what many tasks take)
     choices = HydraConfig.get().runtime.choices
     folder = run_dir.parents[len(Path(name_of(cfg, choices)).parts) - 1]
     own = deepcopy(cfg)
     own.seed = seed
-    with open_dict(own):
-        del own["seeds"]
     return own, folder / name_of(own, choices)
 
 

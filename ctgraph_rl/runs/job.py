@@ -8,12 +8,13 @@ import shutil
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext, suppress
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, open_dict
 from rich.console import Console
 
 from ctgraph_rl.agent import Agent, MethodLike
@@ -435,7 +436,10 @@ def run_seeds(cfg: Any, run_dir: Path) -> list[Path]:
     rule = f"seeds must be a list of different seeds that begins with seed={cfg.seed}, got {seeds}"
     require((are_seeds and seeds[0] == cfg.seed, rule))
     logging.getLogger("torchrl").setLevel(logging.WARNING)
-    cells = [config.of_seed(cfg, seed, run_dir) for seed in seeds]
+    shared = deepcopy(cfg)
+    with open_dict(shared):
+        del shared["seeds"]  # else each of n cells copies n seeds
+    cells = [config.of_seed(shared, seed, run_dir) for seed in seeds]
     for each, folder in cells:
         config.check_values(each)
         folder.mkdir(parents=True, exist_ok=True)

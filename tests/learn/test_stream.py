@@ -210,3 +210,14 @@ def test_tables_of_a_life_have_windows_in_place_of_tasks(tmp_path):
     assert all(math.isnan(value) for value in run.windows("retention_100"))
     assert [curve[-1][0] for curve in run.history.training.values()][:3] == [2 * 64, 4 * 64, 5 * 64]
     assert [len(curve) for curve in run.history.training.values()] == [2, 2, *[1] * 8]
+
+
+@pytest.mark.parametrize(("most", "expected"), [(3, 1), (4, 0)])
+def test_a_run_says_what_many_tasks_take(monkeypatch, most, expected):
+    monkeypatch.setattr("ctgraph_rl.learn.refusals.MANY_TASKS", most)
+    four = curricula.from_axes(num_frames=64)
+
+    said = [note for note in notes(four, None) if note.startswith("4 tasks take about 0 s")]
+
+    assert len(said) == expected
+    assert all("curriculum.goals=random" in note for note in said)

@@ -13,6 +13,7 @@ import yaml
 
 from ctgraph_rl import strict
 from ctgraph_rl.log.damage import metrics_of
+from ctgraph_rl.log.measurement import check
 from ctgraph_rl.log.run_log import RunLog
 
 LINE = b'{"kind": "run", "curriculum": "a", "config": {"seed": 0}}\n'
@@ -82,6 +83,14 @@ def test_what_has_two_meanings_or_takes_too_much_is_refused(name, content, messa
 
     assert message in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_a_line_that_is_whole_makes_no_message():
+    class Silent(str):
+        def __repr__(self) -> str:
+            raise AssertionError("a message was made")
+
+    check({"kind": Silent("training"), "block": 1, "frames": 64, "return_mean": 0.5})
 
 
 def test_a_last_line_without_an_end_is_what_a_killed_run_leaves():
