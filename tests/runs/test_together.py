@@ -365,6 +365,19 @@ def test_as_many_jobs_are_built_as_there_are_seeds(monkeypatch, settings):
     assert built == [0, 1, 2]
 
 
+def test_cells_of_a_group_do_not_copy_its_list_of_seeds(monkeypatch):
+    copied = []
+
+    def stop_before_work(cfg, *_):
+        copied.append("seeds" in cfg)
+        raise RuntimeError("enough")
+
+    monkeypatch.setattr(config, "of_seed", stop_before_work)
+
+    assert sweep(monkeypatch, SEEDS, *PPO, "together=true") == 1
+    assert copied == [False]
+
+
 def configs(*seeds: int, folder: str = "experts") -> list[DictConfig]:
     """Runs of two tasks, whose experts are trained in turn."""
     return [config.composed([*EXPERTS, f"seed={seed}", f"experts_dir={folder}"]) for seed in seeds]
