@@ -114,16 +114,7 @@ def name_of(cfg: DictConfig, choices: Any) -> str:
 
 
 def of_seed(cfg: DictConfig, seed: int, run_dir: Path) -> tuple[DictConfig, Path]:
-<<<<<<< HEAD
-    """Return the configuration and directory of one seed of a job."""
-=======
-    """Return the configuration and directory of one seed of a job.
-
-    Args:
-        cfg: the configuration of the job, with its first seed and without ``seeds``.
-        run_dir: the directory of the first seed.
-    """
->>>>>>> 60e71c01 (A log's messages are made where they are needed; a group's cells copy no list of seeds; a run says what many tasks take)
+    """Return the configuration and directory of one seed of a job; ``cfg`` is without its ``seeds``."""
     choices = HydraConfig.get().runtime.choices
     folder = run_dir.parents[len(Path(name_of(cfg, choices)).parts) - 1]
     own = deepcopy(cfg)
