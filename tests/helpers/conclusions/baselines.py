@@ -28,7 +28,7 @@ def _() -> bool:
     return (len(lines), len(missed)) == (80, 1) and {line["frames"] for line in lines} == {"204800"}
 
 
-@says("Without memory, agents reach the exact limit of policies without memory, and no more.")
+@says("Without memory, greedy agents reach the exact limit of deterministic policies without memory, and no more.")
 def _() -> bool:
     from ctgraph_rl.tasks.configurations import CONFIGURATIONS
 
