@@ -1,4 +1,4 @@
-"""The page about agents: its list is the present one, and its example runs as an outsider would run it."""
+"""The page about agents: it has all members, and its example runs as an outsider would run it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from helpers.paths import CHECKOUT
 from helpers.small_agents import KINDS
 from helpers.sweeping import command_line
 
-from baselines.__main__ import main
 from baselines.parts.catalogue import catalogue
 from ctgraph_rl import RunLog, agent
 from curricula.paper import ct_su_b1
@@ -24,18 +23,6 @@ OWN = (CHECKOUT / "docs" / "how-to" / "own_agent.md").read_text(encoding="utf-8"
 def blocks(language: str, page: str = OWN) -> list[str]:
     """The code blocks of a page in a language."""
     return re.findall(rf"```{language}\n(.*?)```", page, re.DOTALL)
-
-
-def shown(printed: str, page: str) -> bool:
-    """Whether the lines of a page are those of a list as it is printed; a page may lack new ones."""
-    return page.splitlines() == [line for line in printed.splitlines() if line in page.splitlines()]
-
-
-def test_the_page_shows_the_list_of_agents_as_it_is_printed(capsys, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["baselines"])
-    main()
-
-    assert shown(capsys.readouterr().out, blocks("text", TEXT)[0])
 
 
 def test_every_agent_with_a_yaml_is_listed_under_its_name(compose):

@@ -96,7 +96,7 @@ def test_what_masks_end_with_and_what_labels_cost_is_computed_from_the_raw_resul
 
 
 def test_found_changes_and_other_alarms_are_counted_from_the_spans(made, masks):
-    adwin, swoks = masks["adwin"], masks["swoks, fresh"]
+    adwin = masks["adwin"]
     others = {name: [float(span["return_before"]) for span in made.alarms(masks[name])] for name in masks}
     high = {name: sum(each >= 0.9 for each in returns) for name, returns in others.items()}
 
@@ -138,9 +138,6 @@ def test_found_changes_and_other_alarms_are_counted_from_the_spans(made, masks):
         in PAGE
     )
     assert f"With published ones they are {published[0]} and {published[2]} of {published[1]}." in PAGE
-    second = next(span for span in spans[tuple(swoks[1][key] for key in RUN)] if int(span["end"]) > 442_368)
-    assert (second["start"], second["label"], second["learned"]) == ("442368", "1", "True")
-    assert f"label 1 was accepted {442_368 - 384_000:,} frames after the first change" in PAGE
     assert soon == "17 or 18" and "it finds half of the changes that images do not show" in PAGE  # of 35
 
     ends = {name: [float(line["average_performance"]) for line in masks[name]] for name in ("adwin", "swoks")}
