@@ -34,6 +34,7 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "ctgraph_rl.tasks.configurations",
             "ctgraph_rl.core.rewards",
             "ctgraph_rl.tasks.memory",
+            "ctgraph_rl.tasks.curriculum:Stream",
             "ctgraph_rl.tasks.images.image_set",
             "ctgraph_rl.tasks.images.measures",
             "ctgraph_rl.tasks.switch",
@@ -81,6 +82,7 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "ctgraph_rl.metrics.regimes",
             "ctgraph_rl.metrics.labels",
             "ctgraph_rl.metrics.adaptation",
+            "ctgraph_rl.metrics.windows",
         ),
     ),
     "figures": (
@@ -129,6 +131,7 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "baselines.update.update:UpdateState,update,Parts,make_optimiser,has_parts,parts_of,minimise,step",
             "baselines.update.trained:Trained",
             "baselines.parts.embedding",
+            "baselines.cells.cell:Units",
             "baselines.parts.transport",
             "baselines.methods.method",
             "baselines.methods.parts.importance",
