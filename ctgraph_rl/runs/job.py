@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import shutil
 import sys
 from collections.abc import Callable, Sequence
@@ -18,7 +19,7 @@ from omegaconf import DictConfig, open_dict
 from rich.console import Console
 
 from ctgraph_rl.agent import Agent, MethodLike
-from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_int, plain, require, takes_numbers
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_int, plain, require, require_memory, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.disk import is_writable
 from ctgraph_rl.learn.refusals import check_share, notes
@@ -422,6 +423,10 @@ def run_as_one(cells: Sequence[ConfigAndPath], built: RunMember | None = None) -
         raise RuntimeError("; ".join(f"{type(error).__name__}: {error}" for error in failed.values()))
 
 
+WEIGHTS_KEPT = 4
+"""Copies of a seed's weights while it learns: themselves, gradients and Adam's two moments."""
+
+
 def run_seeds(cfg: Any, run_dir: Path) -> list[Path]:
     """Run a configuration of the first seed with each of its ``seeds``, which a sweep lists; return all directories.
 
@@ -448,6 +453,10 @@ def run_seeds(cfg: Any, run_dir: Path) -> list[Path]:
     if cfg.freeze_after is not None and first.curriculum.protocol.task_id != "hidden":
         reason = reason or "a frozen agent acts by its policy for the announced task"
     if reason is None:
+        weights = sum(each.nbytes for each in first.agent.policy.parameters())
+        batch = first.agent.num_envs * first.agent.num_steps * math.prod(first.curriculum.examples[0].observation_shape)
+        needed = len(cells) * (WEIGHTS_KEPT * weights + batch)
+        require_memory(f"weights and a batch of {len(cells):,} seeds", needed, "seeds at a time")
         run_as_one(cells, first)
         return [folder for _, folder in cells]
     print(f"note: seeds are trained one after the other, as {terminal_text(reason)}", file=sys.stderr)

@@ -378,6 +378,15 @@ def test_cells_of_a_group_do_not_copy_its_list_of_seeds(monkeypatch):
     assert copied == [False]
 
 
+def test_more_seeds_than_memory_holds_are_refused_before_they_learn(monkeypatch, capsys):
+    monkeypatch.setattr(job, "WEIGHTS_KEPT", 10**12)
+
+    assert sweep(monkeypatch, SEEDS, *PPO, "together=true") == 1
+
+    said = " ".join("".join(capsys.readouterr()).split())
+    assert "weights and a batch of 3 seeds need " in said and "use fewer seeds at a time" in said, said
+
+
 def configs(*seeds: int, folder: str = "experts") -> list[DictConfig]:
     """Runs of two tasks, whose experts are trained in turn."""
     return [config.composed([*EXPERTS, f"seed={seed}", f"experts_dir={folder}"]) for seed in seeds]
