@@ -49,7 +49,9 @@ class Costless(CapturedGroup):
 
     def acted(self, data: TensorDictBase, greedy: bool = False) -> Items:
         """Return action 0, and the recurrent state unchanged."""
-        written: Items = {"action": torch.zeros(len(self.learners), len(data) // len(self.learners), dtype=torch.int64)}
+        written: Items = {
+            "action": torch.zeros(len(self.learners), len(data) // len(self.learners), dtype=torch.int64, device="cpu")
+        }
         for key in data.keys():  # noqa: SIM118, rows otherwise
             if key.startswith("recurrent_state"):
                 written["next", key] = self.by_seed(data[key])

@@ -102,7 +102,7 @@ def __getattr__(name: str) -> Any:
     if name in _HOMES:
         return getattr(import_module(f"curricula.{_HOMES[name]}"), name)
     # a module that is being imported needs no other
-    if name.startswith("_") or find_spec(f"{__name__}.{name}") is not None or name not in _named():
+    if name.startswith("_") or find_spec(f"curricula.{name}") is not None or name not in _named():
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return _named()[name]
 

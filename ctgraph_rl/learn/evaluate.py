@@ -372,7 +372,7 @@ def evaluate_together(
         policy = InTurn(policies, seeds)  # type: ignore[assignment]  # acts on tensors
     assert policy is not None
     env = first.make_shared_env(tasks, len(evaluators))
-    streams = torch.tensor(seeds, device=env.device).repeat_interleave(count)
+    streams = torch.tensor(seeds, dtype=torch.int64, device=env.device).repeat_interleave(count)
     env.rows.set_streams(streams, torch.arange(count, device=env.device).repeat(len(evaluators)))
     exploration = ExplorationType.DETERMINISTIC if how.greedy else ExplorationType.RANDOM
     with torch.random.fork_rng(devices=[]), set_exploration_type(exploration):

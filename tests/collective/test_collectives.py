@@ -58,8 +58,8 @@ def stop_at_save(monkeypatch, count: int) -> None:
     calls = []
     save = Checkpoints.save
 
-    def stopped(*given):
-        save(*given)
+    def stopped(*given, **settings):
+        save(*given, **settings)
         calls.append(given)
         if len(calls) == count:
             raise KeyboardInterrupt
