@@ -44,7 +44,7 @@ def values(measured):
             "masks_ct8_md",
             (20, {3, 4, 5}),
             (5, {0, 1}),
-            "On CT8 multi-depth each of its 20 runs with one epoch knows three to five tasks at the end; each of the "
+            "On CT8 multi-depth each of its 20 runs with one epoch knows three to five tasks at the end. Each of the "
             "five with 8 epochs knows none or one.",
         ),
         (

@@ -137,11 +137,11 @@ def page() -> str:
     template = Template((TEMPLATES / "collectives.md").read_text(encoding="utf-8"))
     alone = solving_times("1")
     mean = sum(alone) / len(alone)
-    same = "the intervals include 1, so that these few seeds do not show that sharing is sooner"
+    same = "These few seeds do not show that sharing is sooner: the intervals include 1"
     ratios = {number: faster(number) for number in NUMBERS[1:]}
     sooner = all(ratio.low is not None and ratio.low > 1 for ratio in ratios.values())
     texts = {f"faster_{number}": shown(ratio) for number, ratio in ratios.items()}
-    texts |= {"verdict": "sharing is sooner" if sooner else same}
+    texts |= {"verdict": "Sharing is sooner" if sooner else same}
     texts |= {"alone": f"{mean:,.0f}", "most": f"{mean / BATCH:.1f}"} | _of_numbers("1", "") | _of_numbers("8", "_8")
     texts |= known_and_new("4") | known_and_new("16")
     longer = numbers_in(on_l2d2c("1", LONGER), "learning_time")
