@@ -22,7 +22,8 @@ from ctgraph_rl.runs.config import in_sweep
 
 def run_configuration(cfg: Any, run_dir: Path) -> float | None:
     """Run a configuration in an existing directory, and show its results; as `ctgraph_rl.run.run`."""
-    check_objective(cfg.objective, cfg.experts, cfg.objective_until)
+    if cfg.objective is not None or cfg.objective_until is not None:
+        check_objective(cfg.objective, cfg.experts, cfg.objective_until)
     if cfg.report:
         require_packages()
     if "exchange" in cfg:

@@ -54,8 +54,9 @@ OTHERS = (
     "|torchrl|types"
 )
 SHORT_NAMES = (
-    "NDArray|Path|Sequence|Span|Tensor|TensorDictBase|nn.Module|Rule|NamedValues|ReadOnlyValues|Items|Learnt"
+    "NDArray|Path|Sequence|Span|Tensor|TensorDictBase|nn.Module|nn.Linear|Rule|NamedValues|ReadOnlyValues|Items|Learnt"
     "|TensorsByName"
+    r"|ctgraph_rl\.tasks\.life\.\w+"  # parts of a stream
 )
 SETTINGS = r"baselines\.\w+\.\w+Settings"  # the cards of agents list them
 nitpick_ignore_regex = [("py:.*", rf"({OTHERS})(\..*)?"), ("py:class", rf"{SHORT_NAMES}|{SETTINGS}")]
