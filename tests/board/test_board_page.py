@@ -119,7 +119,7 @@ def test_the_table_says_what_the_page_says_of_it(made):
     page = " ".join((RESULTS / "board.md").read_text(encoding="utf-8").split())
     assert made[0].num_seeds == 20 and "Ten keep nearly everything. 20 seeds cannot order them:" in page
     assert "CLEAR are behind them, then CKA-RL and agents without a method." in page
-    assert "MaskSC, which forgets nothing but does not learn every task," in page
+    assert "MaskSC forgets nothing, but does not learn every task." in page
 
 
 def test_the_command_of_the_page_verifies_a_submission(tmp_path, monkeypatch):

@@ -191,12 +191,12 @@ def test_eight_seeds_learn_from_what_each_would_alone_with_its_losses_and_gradie
         compared.append(gradient)
 
     def learned(batch):
+        group.stack.write()
         found = group.first.with_advantage(batch, group.seeds)
         for number, (agent, part) in enumerate(zip(group.learners, batch.chunk(8), strict=True)):
             expected = agent.with_advantage(part, agent.one_seed)
             its = {key: value.chunk(8)[number] for key, value in found.items()}
             torch.testing.assert_close(its, expected, rtol=1e-4, atol=1e-5)
-        group.stack.write()
         minibatches = list(group.first.minibatches_of(batch, group.seeds))
         for number in range(8):
             drawn = torch.cat([minibatch["advantage"][number].flatten() for minibatch in minibatches])
