@@ -21,7 +21,10 @@ SHORT = ("curriculum.num_frames=1024", "agent.num_envs=64", "agent.num_steps=8",
 
 
 REFUSED = [
-    (["curriculum=su_b2"], ["error: unknown curriculum 'su_b2': there are ", ", ctgraph-rl curricula lists them\n"]),
+    (
+        ["curriculum=su_b2"],
+        ["error: unknown curriculum 'su_b2': ctgraph-rl curricula lists those with names, and axes and graph make"],
+    ),
     (
         ["agent=sarsa"],
         ["error: unknown agent 'sarsa': choices: a2c, cavia, dqn, drqn, lstm_ppo, maml, mohqa, pearl, "],

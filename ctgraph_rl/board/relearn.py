@@ -20,7 +20,7 @@ from omegaconf import DictConfig
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, require
 from ctgraph_rl.disk import write_whole
 from ctgraph_rl.runs import config
-from ctgraph_rl.runs.job import learn_experts, run_as_one, run_job
+from ctgraph_rl.runs.job import run_as_one, run_job
 from ctgraph_rl.runs.settings import with_added
 from ctgraph_rl.tasks.curriculum import Curriculum
 
@@ -34,7 +34,6 @@ class Relearning(NamedTuple):
     num_threads: int
     entry_point: str | None  # module:function of a learner that is not ours
     curriculum: str | None  # file of what it learns; None: what the configuration says
-    experts: Sequence[tuple[int, Sequence[int]]] = ()  # learned first: task from 1, and seeds whose experts are a batch
 
     def write(self, path: Path) -> None:
         """Write the job to a file."""
@@ -65,8 +64,6 @@ def learn_again(job: Relearning, folder: Path) -> None:
     runs = [(configuration(_settings(job, seed)), run_dir) for seed, run_dir in zip(job.seeds, run_dirs, strict=True)]
     for run_dir in run_dirs:
         run_dir.mkdir(exist_ok=True)
-    for task, seeds in job.experts:
-        learn_experts([configuration(_settings(job, seed)) for seed in seeds], task)
     if job.together:
         run_as_one(runs)
     else:

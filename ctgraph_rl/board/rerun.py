@@ -1,7 +1,7 @@
 """Level *rerun* of a verification: drawn runs are trained again in separate processes and compared bit by bit.
 
 The drawn runs are those with the smallest SHA-256 of ``DIGEST NUMBER RUN``, so that neither side can choose them. Seeds
-and single-task experts that were trained as one group are trained again as that group.
+that were trained as one group are trained again as that group.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from typing import NamedTuple
 from ctgraph_rl.board.isolate import Isolation, Limits, Outcome, home, run_isolated
 from ctgraph_rl.board.relearn import Relearning, run_dir_of
 from ctgraph_rl.board.rescore import NO_ROW, Check, differing, equal
-from ctgraph_rl.board.submission import Submission, SubmittedRun, counted, experts_of, log_sum
+from ctgraph_rl.board.submission import Submission, SubmittedRun, counted_lines, log_sum
 from ctgraph_rl.board.two_samples import compare_samples
-from ctgraph_rl.checks import ReadOnlyValues, are_ints, require
+from ctgraph_rl.checks import ReadOnlyValues, require
 from ctgraph_rl.disk import make_folder, read_text, require_no_link, write_whole
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CURRICULUM, FAILURE, LOG, METRICS, MOST_BYTES_OF_A_REASON
@@ -87,7 +87,6 @@ class Rerun(NamedTuple):
     agent_sha256: str | None
     failure: str | None  # why it has no results
     agent_bytes: int | None = None  # of its tensors; None if it saved none
-    experts: tuple[RunLog, ...] = ()  # logs of its single-task experts
     failed_alone: bool = False  # whether it failed by itself, and not by a limit or without its code
 
 
@@ -107,20 +106,9 @@ def cells_of(submission: Submission, drawn: Sequence[SubmittedRun], folder: Path
     for seeds in split_by(drawn, lambda run: run.seeds):
         own = folder / f"seed{'-'.join(map(str, seeds))}"
         runs = tuple(groups[seeds])
-        job = job_of(submission, seeds, runs[0])._replace(experts=_groups_of_experts(submission, runs))
+        job = job_of(submission, seeds, runs[0])
         cells.append(RerunCell(own, job, runs, submission.curriculum, max(run.seconds for run in runs)))
     return cells
-
-
-def _groups_of_experts(submission: Submission, runs: Sequence[SubmittedRun]) -> tuple[tuple[int, tuple[int, ...]], ...]:
-    found: dict[tuple[int, tuple[int, ...]], None] = {}
-    for run in runs:
-        for each in experts_of(submission.log(run)) if run.finished else ():
-            seeds = each.get("together", [run.seed])
-            odd = f"the log of {run.run} has an expert with odd seeds, {seeds!r:.80}: restore it"
-            require((are_ints(seeds, 0), odd))
-            found[each["task"], tuple(seeds)] = None
-    return tuple(found)
 
 
 def job_of(
@@ -188,19 +176,9 @@ def result_of(cell: RerunCell, seed: int, outcome: Outcome) -> Rerun:
         has_agent = (run_dir / AGENT).exists()
         state = read_plain(read_content(run_dir / AGENT)) if has_agent else None
         agent, size = (sum_of_state(state), count_bytes(state)) if has_agent else (None, None)
-        return Rerun(log, agent, None, size, _experts(cell.folder.resolve(), log))
+        return Rerun(log, agent, None, size)
     except (ValueError, OSError) as error:
         return Rerun(None, None, str(error))
-
-
-def _experts(folder: Path, log: RunLog) -> tuple[RunLog, ...]:
-    logs = []
-    for each in experts_of(log):
-        path = (folder / str(each.get("run")) / LOG).resolve()
-        outside = "its experts are outside the folder of its process: experts_dir must be a relative path"
-        require((path.is_relative_to(folder), outside))
-        logs.append(RunLog.read(path))
-    return tuple(logs)
 
 
 def _failed(run_dir: Path, outcome: Outcome) -> Rerun:
@@ -236,9 +214,7 @@ def why_other_bits(submission: Submission, runs: Sequence[SubmittedRun]) -> list
     return list(dict.fromkeys(reasons))
 
 
-def checks_of(
-    run: SubmittedRun, submitted: RunLog, result: Rerun, experts: Sequence[RunLog] = (), other_bits: Sequence[str] = ()
-) -> list[Check]:
+def checks_of(run: SubmittedRun, submitted: RunLog, result: Rerun, other_bits: Sequence[str] = ()) -> list[Check]:
     """Compare a submitted run with what was learned again, bit by bit.
 
     A run that cannot finish here, or failed without failing by itself, decides nothing: the machine or a limit may be
@@ -255,15 +231,12 @@ def checks_of(
     note = "" if log.passed else first_difference(submitted, result.log)
     checks = [log._replace(note=note), equal("agent of the rerun", run.agent_sha256, result.agent_sha256, run.run)]
     checks.append(_size_check(run, result.agent_bytes, other_bits))
-    pairs = zip_longest(map(log_sum, experts), map(log_sum, result.experts), fillvalue="none")
-    for number, (one, other) in enumerate(pairs, 1):
-        checks.append(equal(f"log of expert {number} of the rerun", one, other, run.run))
     return [check._replace(level=RERUN) for check in checks]
 
 
 def first_difference(submitted: RunLog, found: RunLog) -> str:
     """Return in words the first measurement in which two logs differ, if any."""
-    lines = zip_longest(map(counted, submitted.measurements), map(counted, found.measurements), fillvalue=NO_ROW)
+    lines = zip_longest(counted_lines(submitted), counted_lines(found), fillvalue=NO_ROW)
     for number, (one, other) in enumerate(lines, 1):
         keys = differing(one, other)
         if keys:
@@ -322,9 +295,7 @@ def verified(submission: Submission, results: Mapping[SubmittedRun, Rerun], othe
     without_bits: list[Check] = []
     scored: list[float | None] = []
     for run, result in results.items():
-        log = submission.log(run)
-        experts = submission.experts(run, log) if run.finished else None
-        checks = checks_of(run, log, result, experts or (), other_bits)
+        checks = checks_of(run, submission.log(run), result, other_bits)
         every += checks
         wrong = [check for check in checks if check.passed is False and check.what != BYTES]
         if run.finished and wrong and result.log is not None and other_bits:

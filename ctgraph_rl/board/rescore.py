@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from ctgraph_rl.board.method_yaml import fact_rules, facts_of, track_version
-from ctgraph_rl.board.submission import Submission, SubmittedRun, experts_of, log_sum
+from ctgraph_rl.board.submission import Submission, SubmittedRun, log_sum
 from ctgraph_rl.board.tracks import TUNING_SEEDS, Track
 from ctgraph_rl.checks import ReadOnlyValues, Rule, require
 from ctgraph_rl.learn.evaluate import Evaluator
@@ -88,7 +88,7 @@ def scores_of(submission: Submission, run: SubmittedRun) -> dict[str, float | No
     log = submission.log(run)
     own = log_sum(log) == run.log_sha256
     require((own, f"the log of {run.run} is another one than the submission names: restore it"))
-    found = scores(log, submission.curriculum, submission.experts(run, log))
+    found = scores(log, submission.curriculum)
     names = board_columns(submission.curriculum)
     if submission.track is not None:
         names = [submission.track.score, *names]
@@ -139,20 +139,7 @@ def _of_the_log(submission: Submission, run: SubmittedRun, log: RunLog) -> Itera
     stored = about.get("machine"), about.get("num_threads"), about.get("cpu")
     yield equal("machine", (run.machine, run.num_threads, run.cpu or None), stored, run.run)
     if run.finished:
-        yield from _of_experts(submission, run, log)
         yield from of_the_protocol(submission, run, log)
-
-
-def _of_experts(submission: Submission, run: SubmittedRun, log: RunLog) -> Iterator[Check]:
-    said = experts_of(log)
-    experts = submission.experts(run, log) or ()
-    yield equal("sums of the logs of experts", run.experts, tuple(map(log_sum, experts)), run.run)
-    alone = [expert.of_kind("run")[0] for expert in experts]
-    for what, key in (("curricula", "fingerprint"), ("groups", "together")):
-        if said or what == "curricula":
-            expected = [each.get(key) for each in said]
-            found = [each.get(key) for each in alone]
-            yield equal(f"{what} of experts", expected, found, run.run)
 
 
 def of_the_protocol(submission: Submission, run: SubmittedRun, log: RunLog) -> Iterator[Check]:

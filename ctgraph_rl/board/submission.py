@@ -1,7 +1,7 @@
 """A submission: a folder of files that show what a method reached.
 
 - ``submission.json``: an object of `PARTS`, with a run of `RUN` for each seed.
-- ``logs/RUN.jsonl.gz``: the log of each run; ``logs/RUN.expert_K.jsonl.gz``: of its single-task expert of task K.
+- ``logs/RUN.jsonl.gz``: the log of each run. Those of single-task experts are no part of it.
 - ``verification.json``: what a verification found; not part of what was submitted.
 
 Readers compute scores from the logs. No code of the folder is ever run.
@@ -14,12 +14,12 @@ import hashlib
 import json
 import re
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from ctgraph_rl.board.method_yaml import COUNT, Kind, check_method, kind_rules, list_of, matching, or_null
 from ctgraph_rl.board.tracks import Track, track
@@ -51,13 +51,6 @@ NOT_COUNTED = ("versions", "machine", "num_threads", "cpu", "source", "num_frame
 """Fields of a log's first line outside its sum; the fingerprint stands for source and frames."""
 
 
-class Field(NamedTuple):
-    """A field of ``submission.json``."""
-
-    kind: Kind
-    meaning: str
-
-
 OBJECT = Kind(lambda value: isinstance(value, dict), "an object")
 ANY_TEXT = Kind(lambda value: isinstance(value, str), "a text")
 SUM = matching("[0-9a-f]{64}", "64 hexadecimal digits")
@@ -72,46 +65,33 @@ def _are_runs(value: object) -> bool:
 
 
 PARTS = {
-    "schema": Field(Kind(lambda value: is_int(value, SCHEMA, SCHEMA), str(SCHEMA)), "version of this format"),
-    "method": Field(OBJECT, "what `method.yaml` says, without the failed seeds"),
-    "config": Field(Kind(OBJECT.holds, "settings"), "the configuration that all runs share, without the seed"),
-    "versions": Field(
-        Kind(_are_texts, "texts by name"),
-        "versions of the packages and of Python that computed the runs, by name",
-    ),
-    "curriculum": Field(OBJECT, "what was learned, see `Curriculum.to_json`"),
-    "runs": Field(Kind(_are_runs, f"a list of 1..{MOST_RUNS:,}"), "an object for each seed"),
+    "schema": Kind(lambda value: is_int(value, SCHEMA, SCHEMA), str(SCHEMA)),
+    "method": OBJECT,
+    "config": Kind(OBJECT.holds, "settings"),
+    "versions": Kind(_are_texts, "texts by name"),
+    "curriculum": OBJECT,
+    "runs": Kind(_are_runs, f"a list of 1..{MOST_RUNS:,}"),
 }
 
 RUN = {
-    "run": Field(matching(NAME.pattern, "a name of a file"), "name of the run, and of its log in `logs/`"),
-    "seed": Field(COUNT, "its seed"),
-    "reason": Field(or_null(ANY_TEXT), "why it failed or was stopped; null for a finished run"),
-    "group": Field(
-        list_of(COUNT, "a list of seeds"),
-        "seeds that were trained together as one batch; empty for a run without others",
-    ),
-    "agent_sha256": Field(
-        or_null(SUM), "SHA-256 of the agent's state: names, types, shapes and bits; null where a run left none"
-    ),
-    "agent_bytes": Field(or_null(COUNT), "bytes of all tensors of that state"),
-    "log_sha256": Field(SUM, "SHA-256 of the log without times, versions and machine"),
-    "experts": Field(
-        list_of(SUM, "sums of 64 hexadecimal digits"), "such a sum for the log of each single-task expert"
-    ),
-    "machine": Field(ANY_TEXT, "kind of machine that it ran on"),
-    "num_threads": Field(COUNT, "threads of torch"),
-    "cpu": Field(ANY_TEXT, "model of the CPU; empty where the system does not say"),
-    "seconds": Field(
-        Kind(lambda value: is_real(value, 0, MOST_SECONDS), f"a number in 0..{MOST_SECONDS:,.0f}"),
-        "time of the run; runs of one group share it",
-    ),
+    "run": matching(NAME.pattern, "a name of a file"),
+    "seed": COUNT,
+    "reason": or_null(ANY_TEXT),
+    "group": list_of(COUNT, "a list of seeds"),
+    "agent_sha256": or_null(SUM),
+    "agent_bytes": or_null(COUNT),
+    "log_sha256": SUM,
+    "experts": Kind(lambda value: value == [], "empty"),  # digests of published submissions have it
+    "machine": ANY_TEXT,
+    "num_threads": COUNT,
+    "cpu": ANY_TEXT,
+    "seconds": Kind(lambda value: is_real(value, 0, MOST_SECONDS), f"a number in 0..{MOST_SECONDS:,.0f}"),
 }
 
 
 @dataclass(frozen=True)
 class SubmittedRun:
-    """One of the ``runs``, with the keys of `RUN`."""
+    """One of the ``runs``, with the keys of `RUN` but ``experts``."""
 
     run: str
     seed: int
@@ -120,7 +100,6 @@ class SubmittedRun:
     agent_sha256: str | None
     agent_bytes: int | None
     log_sha256: str
-    experts: tuple[str, ...]
     machine: str
     num_threads: int
     cpu: str
@@ -171,22 +150,6 @@ class Submission:
             OSError: if it cannot be read.
         """
         return read_log(self.path / log_name(run.run))
-
-    def experts(self, run: SubmittedRun, log: RunLog) -> list[RunLog] | None:
-        """Return the logs of the single-task experts of a run; None if it had none.
-
-        Raises:
-            ValueError: as `log`.
-            OSError: if one of them cannot be read.
-        """
-        found = []
-        left = MOST_BYTES_OF_A_LOG  # of all of them together
-        for each in experts_of(log):
-            path = self.path / log_name(run.run, each["task"])
-            content = unpacked(path, left)
-            left -= len(content)
-            found.append(RunLog.of_content(content, path))
-        return found or None
 
 
 def read_submission(path: Path | str, of_track: Track | None = None, config_dir: Path | None = None) -> Submission:
@@ -254,18 +217,17 @@ def _curriculum(content: ReadOnlyValues, of_track: Track | None) -> Curriculum:
     return same[0]
 
 
-def _check_fields(given: Any, fields: Mapping[str, Field], what: str, owner: str = "") -> None:
-    whole = isinstance(given, dict) and {*given} == {*fields}
-    require((whole, f"{what} {', '.join(fields)}, got {given!r:.80}"))
-    require(*kind_rules(given, {name: field.kind for name, field in fields.items()}, owner))
+def _check_fields(given: Any, kinds: Mapping[str, Kind], what: str, owner: str = "") -> None:
+    whole = isinstance(given, dict) and {*given} == {*kinds}
+    require((whole, f"{what} {', '.join(kinds)}, got {given!r:.80}"))
+    require(*kind_rules(given, kinds, owner))
 
 
 def _run(given: Any) -> SubmittedRun:
     owner = f" of {given.get('run')!r:.80}" if isinstance(given, dict) else ""
     _check_fields(given, RUN, "a run must have", owner)
-    values = dict(given)
-    values["group"] = tuple(given["group"])
-    values["experts"] = tuple(given["experts"])
+    values = {**given, "group": tuple(given["group"])}
+    del values["experts"]
     return SubmittedRun(**values)
 
 
@@ -280,30 +242,17 @@ def submission_text(
     content = {
         "schema": SCHEMA,
         "method": {key: value for key, value in method.items() if key != "failed"},
-        "config": dict(config),
-        "versions": dict(versions),
+        "config": config,
+        "versions": versions,
         "curriculum": curriculum.to_json(),
-        "runs": list(map(asdict, runs)),
+        "runs": [{**asdict(run), "experts": []} for run in runs],
     }
     return json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def log_name(run: str, expert: int | None = None) -> str:
-    """Return the place of a run's log in a submission, or that of its expert of a task from 1."""
-    return f"{LOGS}/{run}{'' if expert is None else f'.expert_{expert}'}.jsonl.gz"
-
-
-def experts_of(log: RunLog) -> list[NamedValues]:
-    """Return what a log says of single-task experts, in the order of tasks."""
-    said: list[NamedValues] = []
-    for line in log.of_kind("experts"):
-        said += line.get("experts", ())
-    for each in said:
-        numbered = isinstance(each, dict) and is_int(each.get("task"), 1)
-        require((numbered, "the log names experts without the numbers of their tasks: restore it"))
-    twice = repeated(each["task"] for each in said)
-    require((not twice, f"the log names two experts of task {listed(twice)}: restore it"))
-    return said
+def log_name(run: str) -> str:
+    """Return the place of a run's log in a submission."""
+    return f"{LOGS}/{run}.jsonl.gz"
 
 
 def packed(content: bytes) -> bytes:
@@ -312,43 +261,41 @@ def packed(content: bytes) -> bytes:
 
 
 def read_log(path: Path) -> RunLog:
-    """Read a log of a submission; errors as `unpacked` and `RunLog.of_content`."""
-    return RunLog.of_content(unpacked(path, MOST_BYTES_OF_A_LOG), path)
-
-
-def unpacked(path: Path, most: int) -> bytes:
-    """Return the content of a submitted log; no more than ``most`` bytes are unpacked.
+    """Read a log of a submission; no more than `MOST_BYTES_OF_A_LOG` are unpacked.
 
     Raises:
-        ValueError: if it is no gzip file, or larger.
+        ValueError: if it is no gzip file, larger, or no log.
         OSError: if it cannot be read.
     """
+    most = MOST_BYTES_OF_A_LOG
     with named(path):
-        data = read_regular(path, MOST_BYTES_OF_A_LOG)
+        data = read_regular(path, most)
         try:
             content = gzip.GzipFile(fileobj=BytesIO(data)).read(most + 1)
         except (EOFError, OSError, zlib.error) as error:
             raise ValueError(f"is no file of gzip: {error}; restore it") from None
         require((len(content) <= most, f"holds more than {most:,} bytes, the limit"))
-    return content
+    return RunLog.of_content(content, path)
 
 
 def log_sum(log: RunLog) -> str:
     """Return the SHA-256 of a log without times, versions and machine: equal for equal runs, bit for bit.
 
-    It is over a line of JSON with sorted keys for each measurement. Later settings with their value for "as before" do
-    not count.
+    It is over a line of JSON with sorted keys for each measurement. Lines on experts, and later settings with their
+    value for "as before", do not count.
     """
     found = hashlib.sha256()
-    for measurement in log.measurements:
-        found.update(json.dumps(counted(measurement), sort_keys=True).encode() + b"\n")
+    for line in counted_lines(log):
+        found.update(json.dumps(line, sort_keys=True).encode() + b"\n")
     return found.hexdigest()
 
 
-def counted(measurement: ReadOnlyValues) -> NamedValues:
-    """Return what of a measurement counts in the log's sum."""
-    kept = without_time(measurement)
-    if kept["kind"] != "run":
-        return kept
-    kept = {key: value for key, value in kept.items() if key not in NOT_COUNTED}
-    return {**kept, "config": as_before(kept.get("config") or {})}
+def counted_lines(log: RunLog) -> Iterator[NamedValues]:
+    """Yield what of each measurement counts in the log's sum."""
+    for measurement in log.measurements:
+        kept = without_time(measurement)
+        if kept["kind"] == "run":
+            kept = {key: value for key, value in kept.items() if key not in NOT_COUNTED}
+            kept["config"] = as_before(kept.get("config") or {})
+        if kept["kind"] != "experts":
+            yield kept

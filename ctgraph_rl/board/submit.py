@@ -19,7 +19,6 @@ from ctgraph_rl.board.submission import (
     SUBMISSION,
     Submission,
     SubmittedRun,
-    experts_of,
     log_name,
     log_sum,
     packed,
@@ -62,11 +61,10 @@ def submit(
     """
     require_new(to)
     runs = _found(paths, only or {})
-    experts = {run.seed: _experts(run) for run in runs if run.reason is None}
-    curriculum = _checked(runs, experts, method, of_track)
+    curriculum = _checked(runs, method, of_track)
     lines = []
     for run, name in zip(runs, _names(runs), strict=True):
-        lines.append(_line(run, name, method["failed"].get(run.seed), experts.get(run.seed, {})))
+        lines.append(_line(run, name, method["failed"].get(run.seed)))
     facts = facts_of(curriculum.protocol, lines)
     require(*fact_rules(method, facts, lines, len(curriculum.tasks)))
     about = completed(method, facts)
@@ -79,8 +77,6 @@ def submit(
         make_folder(folder / LOGS)
         for run, line in zip(runs, lines, strict=True):
             write_whole(folder / log_name(line.run), packed((run.path / LOG).read_bytes()))
-            for number, path in experts.get(run.seed, {}).items():
-                write_whole(folder / log_name(line.run, number), packed(path.read_bytes()))
         config = dict(runs[0].about["config"])
         config.pop("seed", None)
         content = submission_text(about, config, runs[0].about["versions"], curriculum, tuple(lines))
@@ -108,9 +104,7 @@ def _found(paths: Sequence[Path], only: ReadOnlyValues) -> list[Run]:
     return sorted(chosen, key=lambda run: run.seed)
 
 
-def _checked(
-    runs: Sequence[Run], experts: Mapping[int, Mapping[int, Path]], method: ReadOnlyValues, of_track: Track | None
-) -> Curriculum:
+def _checked(runs: Sequence[Run], method: ReadOnlyValues, of_track: Track | None) -> Curriculum:
     seeds = [run.seed for run in runs]
     rules = [*same_rules(runs), *code_rules(runs), *failure_rules(runs, method["failed"])]
     rules += seed_rules(seeds, method["tuning"]["seeds"], of_track)
@@ -120,10 +114,6 @@ def _checked(
     unwritten = list(filterfalse(Path.exists, curricula))
     fix = "as of curricula with classes of your own: submit a named curriculum"
     rules.append((not unwritten, f"{listed(unwritten)} is missing, {fix}"))
-    for run in runs:
-        missing = list(filterfalse(Path.is_file, experts.get(run.seed, {}).values()))
-        fix = "submit from the directory that the run was started in"
-        rules.append((not missing, f"{run.path} was trained with experts, {listed(missing)} cannot be found: {fix}"))
     if unwritten:
         require(*rules)
     first = Curriculum.from_json(curricula[0])
@@ -133,17 +123,13 @@ def _checked(
     return first
 
 
-def _experts(run: Run) -> dict[int, Path]:
-    return {each["task"]: Path(str(each.get("run"))) / LOG for each in experts_of(RunLog.read(run.path / LOG))}
-
-
 def _names(runs: Sequence[Run]) -> list[str]:
     names = [run.path.resolve().name for run in runs]
     usable = all(map(NAME.fullmatch, names)) and not repeated(map(str.lower, names))
     return names if usable else [f"seed{run.seed}" for run in runs]
 
 
-def _line(run: Run, name: str, reason: str | None, experts: Mapping[int, Path]) -> SubmittedRun:
+def _line(run: Run, name: str, reason: str | None) -> SubmittedRun:
     log = RunLog.read(run.path / LOG)
     agent = run.path / AGENT
     state = None
@@ -160,7 +146,6 @@ def _line(run: Run, name: str, reason: str | None, experts: Mapping[int, Path]) 
         agent_sha256=None if state is None else sum_of_state(state),
         agent_bytes=None if state is None else count_bytes(state),
         log_sha256=log_sum(log),
-        experts=tuple(log_sum(RunLog.read(path)) for path in experts.values()),
         machine=str(run.about.get("machine", "")),
         num_threads=int(run.about.get("num_threads", 1)),
         cpu=str(run.about.get("cpu") or ""),

@@ -37,7 +37,6 @@ KEYS = ("version", "title", "measures", "breakthrough", "score", "less_given")
 SCORES = (
     "adapted_return",
     "average_performance",
-    "forward_transfer",
     "held_out_adapted_return",
     "memory_gap_closed",
     "normalised_performance",

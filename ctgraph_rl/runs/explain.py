@@ -120,7 +120,8 @@ def _unknown_file(group: str, name: str, choices: Sequence[str]) -> str:
     if extra is not None:
         return f"this launcher is another package: pip install 'ctgraph_rl[{extra}]'"
     is_long = len(choices) > MOST_CHOICES and nearest(name, choices) is None
-    hint = f"there are {len(choices)}, ctgraph-rl curricula lists them" if is_long else did_you_mean(name, choices)
+    listed = "ctgraph-rl curricula lists those with names, and axes and graph make others"
+    hint = listed if is_long else did_you_mean(name, choices)
     return f"unknown {group or 'configuration'} {name!r}: {hint}"
 
 

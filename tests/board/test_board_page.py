@@ -117,7 +117,7 @@ def test_the_table_says_what_the_page_says_of_it(made):
     [mask_sc] = [line.entry for line in made[0].standings if line.name == "PPO + MaskSC"]
     assert set(mask_sc.values["forgetting"]) == {0.0} and fmean(mask_sc.scores) < 0.95
     page = " ".join((RESULTS / "board.md").read_text(encoding="utf-8").split())
-    assert made[0].num_seeds == 20 and "Ten keep nearly everything. 20 seeds cannot order them:" in page
+    assert len(made[0].track.seeds) == 20 and "Ten keep nearly everything. 20 seeds cannot order them:" in page
     assert "CLEAR are behind them, then CKA-RL and agents without a method." in page
     assert "MaskSC forgets nothing, but does not learn every task." in page
 

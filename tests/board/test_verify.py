@@ -196,21 +196,6 @@ def test_seeds_that_were_trained_together_are_drawn_as_their_group(tiny_submissi
     assert (cell.job.seeds, cell.job.together, cell.runs) == ((0, 1), True, runs)
 
 
-@pytest.mark.slow
-def test_experts_are_trained_again_in_the_groups_of_seeds_in_which_they_were(tiny_submission, tmp_path, monkeypatch):
-    said = [{"task": 1, "together": [0, 1]}, {"task": 2}]
-    monkeypatch.setattr(rerun, "experts_of", lambda log: said)
-    (cell,) = cells_of(tiny_submission, tiny_submission.runs[:1], tmp_path)
-    monkeypatch.chdir(tmp_path)
-    cell.job._replace(config={**cell.job.config, "experts": True}).write(tmp_path / "job.json")
-
-    relearn.learn_again(Relearning.read(tmp_path / "job.json"), tmp_path)
-
-    [found] = RunLog.read(tmp_path / "seed0" / "run.jsonl").of_kind("experts")
-    assert [expert.get("together") for expert in found["experts"]] == [[0, 1], None, None, None]
-    assert len(list(Path("runs/experts").iterdir())) == 5
-
-
 @pytest.mark.parametrize(
     ("found", "passed"), [([0.8, 0.9], True), ([0.1, 0.2], False), ([0.1], None)], ids=["equal", "lower", "too few"]
 )
@@ -231,7 +216,7 @@ def test_where_bits_are_not_promised_scores_are_tested_and_the_power_is_stated(
     assert ({size.what for size in sizes}, all(size.passed for size in sizes)) == ({rerun.BYTES}, True)
     for share, alike in ((1.09, True), (0.89, False), (1.11, False)):
         grown = other._replace(agent_bytes=int(run.agent_bytes * share))
-        size = next(each for each in rerun.checks_of(run, RunLog(), grown, (), ["numbers"]) if each.what == rerun.BYTES)
+        size = next(each for each in rerun.checks_of(run, RunLog(), grown, ["numbers"]) if each.what == rerun.BYTES)
         assert size.passed is alike
     assert (undecided.what, undecided.passed) == ("rerun", None)
     assert check.note == "bits differ, as they may with cpu A there, B here"
@@ -370,28 +355,6 @@ def test_a_failed_run_is_confirmed_by_its_own_failure_alone(tiny_submission, tmp
 
     assert (result.log, result.failed_alone) == (None, alone)
     assert result.failure
-
-
-def test_logs_of_experts_are_compared_and_are_those_of_the_rerun(tiny_home, tiny_submission, tmp_path):
-    run, (cell,) = tiny_submission.runs[0], cells_of(tiny_submission, tiny_submission.runs[:1], tmp_path)
-    for copy in ("seed0", "experts/one"):
-        shutil.copytree(tiny_home / "runs" / "tiny-seed0", cell.folder / copy)
-    log_of = cell.folder / "seed0" / "run.jsonl"
-    lines = log_of.read_text().splitlines(keepends=True)
-
-    def found(folder):
-        experts = json.dumps({"kind": "experts", "experts": [{"task": 1, "run": folder}]})
-        log_of.write_text("".join([*lines, experts + "\n"]))
-        return result_of(cell, 0, Outcome(0, None, ""))
-
-    other = RunLog.of_content("".join(lines[:-1]).encode(), log_of)
-    result = found("experts/one")
-    checks = [rerun.checks_of(run, result.log, result, experts)[-1] for experts in (result.experts, [other], [])]
-
-    assert [(check.what, check.passed) for check in checks] == [
-        ("log of expert 1 of the rerun", passed) for passed in (True, False, False)
-    ]
-    assert "outside the folder of its process" in found(str(tiny_home / "runs" / "tiny-seed0")).failure
 
 
 @pytest.mark.parametrize(

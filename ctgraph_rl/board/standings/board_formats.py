@@ -1,20 +1,19 @@
-"""Tables of the board as Markdown, LaTeX, CSV and JSON."""
+"""What tables of the board show, as cells, CSV and JSON."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from ctgraph_rl import __version__
 from ctgraph_rl.board.standings.board_tables import BoardTable, Standing, is_significant
-from ctgraph_rl.board.standings.entries import LEVELS, shown_level
+from ctgraph_rl.board.standings.entries import LEVELS
 from ctgraph_rl.board.standings.track_ceilings import in_words
 from ctgraph_rl.checks import NamedValues
-from ctgraph_rl.log.escape import csv_text, markdown_table, markdown_text
+from ctgraph_rl.log.escape import csv_text
 from ctgraph_rl.metrics import METRICS
 from ctgraph_rl.report.formats import MEANS, measure_name
-from ctgraph_rl.report.latex import PREAMBLE, Labels, TableCell, latex
-from ctgraph_rl.report.latex import Table as LatexTable
 from ctgraph_rl.report.statistics import Estimate
 
 SCHEMA = 1
@@ -23,9 +22,6 @@ LEGEND = (
     f"{MEANS}; rank: those that comparisons of all pairs leave open, seed by seed, with Holm's correction at 5 %; "
     "n: seeds with a score; bytes per task: kept for each further task, as the authors say; hours: of all seeds"
 )
-
-
-NOT_IN_LATEX = ("method", "bytes of the agent", "steps")
 
 
 class BoardColumn(NamedTuple):
@@ -99,115 +95,83 @@ def verdicts(table: BoardTable) -> list[tuple[str, str, str]]:
     return shown
 
 
-def markdown(tables: Sequence[BoardTable]) -> str:
-    """Return all tables in Markdown."""
-    parts = ["# Board", f"{LEGEND}."]
-    for table in tables:
-        track = table.track
-        parts.append(f"## {markdown_text(table.title)}")
-        parts.append(f"{markdown_text(track.measures)} Breakthrough: {markdown_text(track.breakthrough)}")
-        parts.append("; ".join(f"{markdown_text(name)}: {markdown_text(value)}" for name, value in facts(table)) + ".")
-        rows = []
-        for line in table.standings:
-            cells = columns(line)
-            rows.append([markdown_text(f"{cell.shown} {cell.interval}".strip()) for cell in cells])
-        parts.append(markdown_table([cell.head for cell in cells], rows))
-        if notes(table):
-            parts.append("\n".join(f"- {markdown_text(note)}" for note in notes(table)))
-    return "\n\n".join(parts) + "\n"
-
-
-def tables_tex(tables: Sequence[BoardTable]) -> str:
-    """Return all tables in LaTeX."""
-    labels = Labels()
-    parts = [PREAMBLE]
-    for table in tables:
-        rows = []
-        for line in table.standings:
-            cells = [cell for cell in columns(line) if cell.head not in NOT_IN_LATEX]
-            rows.append((line.name, [TableCell(cell.shown, cell.interval) for cell in cells]))
-        label = labels.new("board", table.track.id, table.variant.rung, table.variant.given)
-        caption = f"{table.title}: {LEGEND}."
-        parts.append(latex(LatexTable(caption, label, "method", [cell.head for cell in cells], rows)))
-    return "\n\n".join(parts) + "\n"
-
-
-ENTRY_COLUMNS = {
-    "submission": "first digits of the submission's digest",
-    "method": "name of the method",
-    "track": "track with its version",
-    "rung": "rung of a ladder; empty for a track of one curriculum",
-    "given": "what the learner was given to know of tasks",
-    "fingerprint": "what the curriculum is, in 16 digits",
-    "steps": "frames that each seed learned from",
-    "best_rank": "best rank that the comparisons leave open; empty without a rank",
-    "worst_rank": "worst rank that the comparisons leave open",
-    "score": "name of the metric that orders the table",
-    "value": "its mean over seeds",
-    "low": "lower end of the 95 % interval",
-    "high": "upper end of the 95 % interval",
-    "seeds": "seeds with a value",
-    "seeds_without": "seeds without a value",
-    "bytes_per_task": "bytes kept for each further task, as the authors say",
-    "agent_bytes": "bytes of the largest agent",
-    "hours": "hours of computing of all its runs",
-    "level": f"how far it was verified: {', '.join(map(shown_level, LEVELS))}; scores: not by bits",
-}
-
-SCORE_COLUMNS = {
-    "submission": "first digits of the submission's digest",
-    "seed": "seed of the run",
-    "metric": "name of the metric",
-    "value": "its value; empty where it is undefined or the run failed",
-}
-
-
 def entries_csv(tables: Sequence[BoardTable]) -> str:
-    """Return a line for each entry."""
-    rows: list[Sequence[Any]] = [list(ENTRY_COLUMNS)]
+    """Return a line for each entry; the interval is of 95 %, hours are those of all runs."""
+    rows = []
     for table in tables:
         variant = table.variant
         for line in table.standings:
             entry = line.entry
             score = line.score
-            about = (entry.id, entry.name, table.track.id, variant.rung, variant.given)
-            learned = (variant.curriculum.fingerprint, entry.frames, line.best_rank, line.worst_rank)
-            reached = (table.track.score, score.value, score.low, score.high, score.n, score.n_undefined)
-            kept = (entry.method["bytes_per_task"], entry.agent_bytes, entry.hours, entry.verified)
-            rows.append([*about, *learned, *reached, *kept])
-    return csv_text(rows)
+            row = {
+                "submission": entry.id,
+                "method": entry.name,
+                "track": table.track.id,
+                "rung": variant.rung,
+                "given": variant.given,
+                "fingerprint": variant.curriculum.fingerprint,
+                "steps": entry.frames,
+                "best_rank": line.best_rank,
+                "worst_rank": line.worst_rank,
+                "score": table.track.score,
+                "value": score.value,
+                "low": score.low,
+                "high": score.high,
+                "seeds": score.n,
+                "seeds_without": score.n_undefined,
+                "bytes_per_task": entry.method["bytes_per_task"],
+                "agent_bytes": entry.agent_bytes,
+                "hours": entry.hours,
+                "level": entry.verified,
+            }
+            rows.append(row)
+    return csv_text([rows[0], *map(dict.values, rows)])
 
 
 def scores_csv(tables: Sequence[BoardTable]) -> str:
-    """Return a line for each metric of each seed of each entry."""
-    rows: list[Sequence[Any]] = [list(SCORE_COLUMNS)]
+    """Return a line for each metric of each seed of each entry; undefined values are empty."""
+    rows: list[tuple[Any, ...]] = [("submission", "seed", "metric", "value")]
     for table in tables:
         for line in table.standings:
-            for metric, values in line.entry.values.items():
-                for seed, value in zip(line.entry.seeds, values, strict=True):
-                    rows.append([line.entry.id, seed, metric, value])
+            entry = line.entry
+            for metric, values in entry.values.items():
+                for seed, value in zip(entry.seeds, values, strict=True):
+                    rows.append((entry.id, seed, metric, value))
     return csv_text(rows)
 
 
-def as_json(tables: Sequence[BoardTable]) -> NamedValues:
-    """Return all tables as plain values."""
-    return {"schema": SCHEMA, "made_by": f"ctgraph_rl {__version__}", "tables": list(map(_json, tables))}
+def as_json(tables: Sequence[BoardTable]) -> str:
+    """Return all tables as JSON."""
+    content = {"schema": SCHEMA, "made_by": f"ctgraph_rl {__version__}", "tables": list(map(_values, tables))}
+    return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
 
-def _json(table: BoardTable) -> NamedValues:
+def _values(table: BoardTable) -> NamedValues:
     track = table.track
     variant = table.variant
+    entries = []
+    for line in table.standings:
+        entry = line.entry
+        values = {
+            "name": line.name,
+            "digest": entry.digest,
+            "method": entry.method,
+            "level": entry.level,
+            "bits": entry.verification.bits,
+            "best_rank": line.best_rank,
+            "worst_rank": line.worst_rank,
+            "why_not_ranked": entry.why_not_ranked,
+            "measures": {name: _numbers(estimate) for name, estimate in line.estimates.items()},
+            "values": entry.values,
+            "agent_bytes": entry.agent_bytes,
+            "failed": entry.failed,
+        }
+        entries.append(values)
     comparisons = []
     for (one, other), found in table.pairs.items():
-        comparisons.append(
-            {
-                "first": one,
-                "second": other,
-                "difference": _numbers(found.difference),
-                "p_value": found.p_value,
-                "holm": found.holm,
-            }
-        )
+        difference = _numbers(found.difference)
+        pair = {"first": one, "second": other, "difference": difference, "p_value": found.p_value, "holm": found.holm}
+        comparisons.append(pair)
     return {
         "track": {"name": track.name, "version": track.version, "measures": track.measures},
         "breakthrough": track.breakthrough,
@@ -215,29 +179,11 @@ def _json(table: BoardTable) -> NamedValues:
         "given": variant.given,
         "curriculum": {"name": variant.curriculum.name, "fingerprint": variant.curriculum.fingerprint},
         "steps": variant.curriculum.num_frames,
-        "seeds": list(track.seeds),
+        "seeds": track.seeds,
         "score": {"name": track.score, "definition": METRICS[track.score].meaning.id},
         "ceilings": table.ceilings._asdict(),
-        "entries": list(map(_json_line, table.standings)),
+        "entries": entries,
         "comparisons": comparisons,
-    }
-
-
-def _json_line(line: Standing) -> NamedValues:
-    entry = line.entry
-    return {
-        "name": line.name,
-        "digest": entry.digest,
-        "method": dict(entry.method),
-        "level": entry.level,
-        "bits": entry.verification.bits,
-        "best_rank": line.best_rank,
-        "worst_rank": line.worst_rank,
-        "why_not_ranked": entry.why_not_ranked,
-        "measures": {name: _numbers(estimate) for name, estimate in line.estimates.items()},
-        "values": {name: list(values) for name, values in entry.values.items()},
-        "agent_bytes": entry.agent_bytes,
-        "failed": dict(zip(map(str, entry.failed), entry.failed.values(), strict=True)),
     }
 
 

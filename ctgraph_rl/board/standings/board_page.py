@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import json
 import re
 import sys
 from collections.abc import Sequence
@@ -57,9 +56,7 @@ def write_board(
     folder = make_folder(Path(folder))
     files = {
         PAGE: html(made, problems),
-        "board.md": formats.markdown(made),
-        "tables.tex": formats.tables_tex(made),
-        "board.json": json.dumps(formats.as_json(made), indent=1, allow_nan=False) + "\n",
+        "board.json": formats.as_json(made),
         "entries.csv": formats.entries_csv(made),
         "scores.csv": formats.scores_csv(made),
     }

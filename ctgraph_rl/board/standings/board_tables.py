@@ -7,6 +7,7 @@ significantly better, at worst before all that are significantly worse.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -74,11 +75,6 @@ class BoardTable:
         """What its tasks allow."""
         return ceilings_of(self.variant.curriculum)
 
-    @property
-    def num_seeds(self) -> int:
-        """Seeds of each entry."""
-        return len(self.track.seeds)
-
 
 def tables(entries: Iterable[BoardEntry]) -> list[BoardTable]:
     """Return a table for all comparable entries, in the order of tracks, rungs and what is given."""
@@ -93,37 +89,28 @@ def tables(entries: Iterable[BoardEntry]) -> list[BoardTable]:
 
 
 def _table(entries: Sequence[BoardEntry]) -> BoardTable:
-    lines = list(map(Standing, entries, names_of(entries), map(_estimates, entries)))
+    track = entries[0].track
+    variant = entries[0].variant
+    bounds = bounds_of_curriculum(variant.curriculum)
+    lines = []
+    for entry, name in zip(entries, names_of(entries), strict=True):
+        estimates = {metric: bounds.estimate(metric, values) for metric, values in entry.values.items()}
+        lines.append(Standing(entry, name, estimates))
     lines.sort(key=lambda line: (line.score.value is None, -(line.score.value or 0.0), line.name))
     ranked = [line for line in lines if line.entry.why_not_ranked is None]
-    pairs = _pairs(ranked)
-    for place, line in enumerate(lines):
-        if line.entry.why_not_ranked is None:
-            lines[place] = _ranked(line, pairs, len(ranked))
-    return BoardTable(entries[0].track, entries[0].variant, lines, pairs)
-
-
-def _estimates(entry: BoardEntry) -> dict[str, Estimate]:
-    bounds = bounds_of_curriculum(entry.variant.curriculum)
-    return {name: bounds.estimate(name, values) for name, values in entry.values.items()}
-
-
-def _pairs(lines: Sequence[Standing]) -> dict[tuple[str, str], Comparison]:
     found = {}
-    for one, other in combinations(lines, 2):
-        bounds = bounds_of_curriculum(one.entry.variant.curriculum).of_metric(one.entry.track.score)
-        found[one.name, other.name] = statistics.compare(one.entry.scores, other.entry.scores, bounds=bounds)
-    return statistics.corrected(found)
-
-
-def _ranked(line: Standing, pairs: Mapping[tuple[str, str], Comparison], count: int) -> Standing:
-    best = 1
-    worst = count
-    for (one, other), found in pairs.items():
-        if is_significant(found):
-            best += line.name == other
-            worst -= line.name == one
-    return replace(line, best_rank=best, worst_rank=worst)
+    for one, other in combinations(ranked, 2):
+        scores = one.entry.scores, other.entry.scores
+        found[one.name, other.name] = statistics.compare(*scores, bounds=bounds.of_metric(track.score))
+    pairs = statistics.corrected(found)
+    significant = [names for names, comparison in pairs.items() if is_significant(comparison)]
+    better = Counter(one for one, _ in significant)
+    worse = Counter(other for _, other in significant)
+    for place, line in enumerate(lines):
+        if line in ranked:
+            last = len(ranked) - better[line.name]
+            lines[place] = replace(line, best_rank=1 + worse[line.name], worst_rank=last)
+    return BoardTable(track, variant, lines, pairs)
 
 
 def is_significant(found: Comparison) -> bool:

@@ -15,7 +15,6 @@ from ctgraph_rl.board.submission import SUBMISSION, VERIFICATION, Submission, re
 from ctgraph_rl.board.tracks import Track, Variant
 from ctgraph_rl.checks import ReadOnlyValues, is_int, repeated, require
 from ctgraph_rl.disk import read_regular
-from ctgraph_rl.log.escape import listed
 from ctgraph_rl.report.bounds_of_runs import bounds_of_curriculum
 from ctgraph_rl.report.columns import board_columns
 from ctgraph_rl.report.intervals import Bounds, within_bounds
@@ -26,11 +25,6 @@ LEVELS = ("failed", "submitted", "rescored", "rerun", "held_out")
 """How far a submission was verified, in rising order; ``failed``: a verification found a difference."""
 
 OF_FILES = {"none": "failed", **{level: level for level in LEVELS[2:]}}
-
-FIELDS = (
-    *("schema", "level", "bits", "digest", "number", "cells", "held_out_seeds", "isolation", "checks"),
-    *("machine", "num_threads", "cpu", "versions"),
-)
 
 DIGITS = 12
 
@@ -195,26 +189,19 @@ def verification_of(submission: Submission) -> Verification:
         return Verification("submitted", why_none=why)
     if found.get("digest") != submission.digest:
         return Verification("submitted", why_none=f"{VERIFICATION} is of other files; verify the submission again")
-    return Verification(OF_FILES[found["level"]], found.get("bits", True))
+    return Verification(OF_FILES[found["level"]], found["bits"])
 
 
 def _check_verification(given: Any) -> None:
     require((isinstance(given, dict), f"it must be an object, got {given!r:.80}"))
-    unknown = [name for name in given if name not in FIELDS]
-    present = {name: given.get(name) for name in ("schema", "level", "checks")}
-    present["bits"] = given.get("bits", True)
-    rules = [(holds, f"its {message}") for holds, message in kind_rules(present, KINDS)]
-    require(*rules, (not unknown, f"it has unknown fields, {listed(unknown)}"))
-    checks = [Check(*(check.get(name, "") for name in Check._fields)) for check in given["checks"]]
-    reached = verify.level_of(checks)
+    known = {name: given.get(name) for name in KINDS}
+    require(*((holds, f"its {message}") for holds, message in kind_rules(known, KINDS)))
+    reached = verify.level_of([Check(**check) for check in given["checks"]])
     require((reached == given["level"], f"its checks give the level {reached}, not {given['level']}"))
 
 
 def _is_check(value: Any) -> bool:
-    if not isinstance(value, dict) or not {*value} <= {*Check._fields}:
-        return False
-    texts = {type(each) for name, each in value.items() if name != "passed"}
-    return texts <= {str} and type(value.get("passed", "")) in (bool, type(None))
+    return isinstance(value, dict) and {*value} == {*Check._fields} and type(value["passed"]) in (bool, type(None))
 
 
 KINDS = {

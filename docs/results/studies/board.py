@@ -108,6 +108,5 @@ def draw(of: BoardTable, path: Path) -> None:
 def make() -> None:
     """Write the page, its figure and the files of the board."""
     made = write_board([FOLDER], FOLDER)
-    (FOLDER / "board.md").unlink()  # the page has the same tables
     (HERE / "board.md").write_text(page(made.tables), encoding="utf-8")
     draw(made.tables[0], HERE / "board.png")
