@@ -332,6 +332,9 @@ def test_the_name_of_a_run_holds_curriculum_agent_seed_and_what_else_changes_res
     assert other != plain
     assert same == directory("cell=lstm") == plain
     assert directory("cell=lstm", "agent.cell.reads_action=true") != plain
+    axes = ("curriculum=axes", "curriculum.configuration=fo_b1")
+    written = {directory(*axes, f"curriculum.goals={goals}") for goals in ("[1.2]", '["1.2"]', "[[1,2]]")}
+    assert len(written) == 1 and directory(*axes, "curriculum.goals=[1.1]") not in written
 
 
 def test_a_folder_that_shadows_our_curricula_is_refused_with_its_path(monkeypatch, capsys, tmp_path):

@@ -71,7 +71,7 @@ class StepCounter(TextBar):
         if self.console.is_terminal:
             self._bar.start()
             self._bar.update(self._task, completed=done, total=total, description=text)
-        elif self._last_line == self._first or self._now - self._last_line >= SECONDS_BETWEEN_LINES:
+        elif self._now - self._last_line >= SECONDS_BETWEEN_LINES:
             self._last_line = self._now
             self._print(text)
 

@@ -75,3 +75,18 @@ def objective(run: Run) -> str | None:
         return None
     name = run.about["config"].get("objective")
     return name if isinstance(name, str) else "online_return"
+
+
+def caveats(run: Run) -> dict[str, str]:
+    """Return what a reader of a run's metrics must know, by the metric: a sentence where one is needed."""
+    known = {name: metric["value"] for name, metric in run.metrics.items()}
+    found = {}
+    learned = known.get("tasks_learned")
+    tasks = {task for block in run.history.trained for task in block} if run.history else set()
+    if learned is not None and learned < len(tasks):
+        sentence = f"{learned:g} of {len(tasks)} tasks were learned in their blocks; no other can be forgotten"
+        found = {"forgetting": sentence, "relative_forgetting": sentence}
+    never = known.get("never_adapted")
+    if never:
+        found["adaptation_frames"] = f"at least; {never:.0%} of tasks never reach 0.9, and count their whole block"
+    return found

@@ -22,7 +22,7 @@ from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.tables import check_table, write_evaluations
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.bounds_of_runs import BoundsOfRuns, bounds_by_curriculum
-from ctgraph_rl.report.columns import WHERE_KNOWN, columns_of_runs, objective
+from ctgraph_rl.report.columns import WHERE_KNOWN, caveats, columns_of_runs, objective
 from ctgraph_rl.report.formats import FORMATS, LEGENDS, NO_RUN_FINISHED, SENTENCES
 from ctgraph_rl.report.intervals import scipy
 from ctgraph_rl.report.names import displayed, modifications
@@ -236,8 +236,11 @@ def _lines(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[Measure
     if not definitions:
         estimate = mean([None] * len(by_seed))
         yield NO_RUN_FINISHED, estimate, "", _note(by_seed, None, estimate)
+    tuned = objective(present(by_seed)[0])
     for name, definition in definitions.items():
         estimate = _metric(by_seed, name, bounds, kind)
+        if name == tuned:
+            estimate = replace(estimate, digits=4)  # trials differ by little
         yield name, estimate, definition, _note(by_seed, name, estimate)
     ended: dict[str, Estimate] = {}
     if any(run.tasks for run in present(by_seed)):
@@ -305,7 +308,8 @@ def _note(by_seed: BySeed, metric: str | None, estimate: Estimate) -> str:
         elif metric not in run.metrics:
             reason = "another version, without this metric"
         else:
-            reason = run.metrics[metric]["undefined"] if run.metrics[metric]["value"] is None else None
+            undefined = run.metrics[metric]["value"] is None
+            reason = run.metrics[metric]["undefined"] if undefined else caveats(run).get(metric)
         if reason is not None:
             reasons.setdefault(reason, []).append(str(seed))
     notes = [f"seed {', '.join(seeds)}: {reason}" for reason, seeds in reasons.items()]

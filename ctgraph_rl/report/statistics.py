@@ -60,6 +60,7 @@ class Estimate:
         method: what value and interval are.
         reason: why value or interval are missing, or why an interval of equal seeds is wide.
         std: standard deviation over seeds, shown in place of an interval.
+        digits: after the point, where it is shown.
 
     Raises:
         ValueError: for an interval without a value, with one end, or that excludes its value.
@@ -73,6 +74,7 @@ class Estimate:
     method: str
     reason: str | None = None
     std: float | None = None
+    digits: int = 2
 
     def __post_init__(self) -> None:
         if (self.low, self.high) != (None, None):
@@ -88,10 +90,11 @@ class Estimate:
     @property
     def shown(self) -> str:
         """The value, with its interval or standard deviation."""
-        value = "-" if self.value is None else f"{self.value:z.2f}"
+        form = f"z.{self.digits}f"
+        value = "-" if self.value is None else f"{self.value:{form}}"
         if self.std is not None:
-            return f"{value} ± {self.std:.2f}"
-        return value if self.low is None or self.high is None else f"{value} [{self.low:z.2f}, {self.high:z.2f}]"
+            return f"{value} ± {self.std:{form}}"
+        return value if self.low is None or self.high is None else f"{value} [{self.low:{form}}, {self.high:{form}}]"
 
     @property
     def seeds(self) -> str:

@@ -18,17 +18,12 @@ from rich.text import Text
 from ctgraph_rl.checks import ReadOnlyValues, require
 from ctgraph_rl.log.escape import listed, terminal_text
 from ctgraph_rl.log.provenance import numbers_of
-from ctgraph_rl.report.columns import WHERE_KNOWN, columns, objective
+from ctgraph_rl.report.columns import WHERE_KNOWN, caveats, columns, objective
 from ctgraph_rl.report.formats import measure_name
 from ctgraph_rl.report.names import modification
 from ctgraph_rl.runs.read import FOLDER, MOST_SEEDS, Curve, History, Problem, Run, code_of, read_run
 from ctgraph_rl.runs.settings import as_before
 
-LIFELONG = {
-    "forward_transfer_ratio": "forward transfer ratio",
-    "backward_transfer_ratio": "backward transfer ratio",
-}
-"""Transfer as ratios, where 1 means none."""
 OF_DETECTION = ("detection_delay", "false_alarms", "labels_per_task", "label_agreement")
 """Metrics that are shown; the file has all."""
 
@@ -84,6 +79,9 @@ def print_summary(run_dir: Path | str, console: Console | None = None) -> None:
         tables = [_life(name, run)]
     for table in (*tables, metrics_table(run.metrics, always)):
         console.print(table)
+    for metric, sentence in caveats(run).items():
+        if metric in always:
+            console.print(_text(f"{measure_name(metric)}: {sentence}"))
 
 
 def _width(table: Table) -> int:
@@ -140,10 +138,13 @@ def _life(name: str, run: Run) -> Table:
     table = Table(title=_text(f"{name}: means over windows of tasks"))
     table.add_column("window", no_wrap=True)
     for metric in IN_WINDOWS:
-        table.add_column(measure_name(metric).removeprefix("window "), justify="right")
+        table.add_column(metric.replace("_", "\n"), justify="right")
     for number, label in enumerate(run.history.labels if run.history else ()):
-        terms = [run.windows(metric)[number] for metric in IN_WINDOWS]
-        shown = ["-" if math.isnan(term) else f"{term:z,.{0 if term >= 100 else 2}f}" for term in terms]
+        terms = {metric: run.windows(metric)[number] for metric in IN_WINDOWS}
+        shown = []
+        for metric, term in terms.items():
+            at_least = ">= " if metric == "adaptation_frames" and terms["never_adapted"] > 0 else ""
+            shown.append("-" if math.isnan(term) else f"{at_least}{term:z,.{0 if term >= 100 else 2}f}")
         table.add_row(_text(label), *shown)
     return table
 
@@ -157,13 +158,12 @@ def metrics_table(metrics: Mapping[str, ReadOnlyValues], always: Sequence[str]) 
     table = Table(title=f"Metrics; metrics.json has all {len(metrics)}")
     for name, justify in (("metric", "left"), ("value", "right"), ("definition", "left")):
         table.add_column(name, justify=justify)  # type: ignore[arg-type]
-    for name in (*always, *LIFELONG, *WHERE_KNOWN, *OF_DETECTION):
+    for name in (*always, *WHERE_KNOWN, *OF_DETECTION):
         metric = metrics.get(name)
         if metric is None or (name not in always and metric["value"] is None):
             continue
         value = "undefined" if metric["value"] is None else f"{metric['value']:z.2f}"
-        neutral = "1 is neutral: " if name in LIFELONG else ""
-        table.add_row(measure_name(name), value, _text(neutral + (metric["undefined"] or metric["formula"])))
+        table.add_row(measure_name(name), value, _text(metric["undefined"] or metric["formula"]))
     return table
 
 

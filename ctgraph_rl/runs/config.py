@@ -39,6 +39,7 @@ from ctgraph_rl.checks import (
     positive,
     require,
 )
+from ctgraph_rl.core.goal import read_goal, write_goal
 from ctgraph_rl.disk import make_folder, write_whole
 from ctgraph_rl.log.named_curricula import curriculum_named
 from ctgraph_rl.packages import check_packages, conf_dir, importing_from_here
@@ -88,6 +89,10 @@ def plain(cfg: DictConfig) -> NamedValues:
     if cfg.get("objective_until") is not None:
         kept.append("objective")
     values: Any = OmegaConf.to_container(OmegaConf.masked_copy(cfg, kept), resolve=True)
+    curriculum = values.get("curriculum")
+    if isinstance(curriculum, dict) and isinstance(curriculum.get("goals"), list):
+        goals = map(read_goal, curriculum["goals"])  # one run, however its goals are written
+        curriculum["goals"] = [write_goal(goal) if isinstance(goal, tuple) else goal for goal in goals]
     return {key: value for key, value in values.items() if value != {}}
 
 

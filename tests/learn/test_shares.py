@@ -159,7 +159,7 @@ def test_a_tuning_run_has_metrics_of_training_alone_and_tables_leave_it_out_unle
     results_main()
     shown = capsys.readouterr().out
     _, tuned, untuned = shown.split("objective_until=")
-    assert tuned.split()[:4] == ["0.45", "online", "return", f"{value:.2f}"] and "n = 1 " in tuned
+    assert tuned.split()[:4] == ["0.45", "online", "return", f"{value:.4f}"] and "n = 1 " in tuned
     assert "None\n    average performance" in untuned and "n = 1 " in untuned
     assert "n = 0" not in shown and "n = 1/2" not in shown
 

@@ -12,6 +12,7 @@ import pytest
 import torch
 from helpers.scripted import Scripted
 from helpers.stopped_runs import logs_of_equal_ends, make_agent
+from rich.console import Console
 
 import curricula
 from baselines.methods.finetune import Finetune
@@ -20,6 +21,7 @@ from ctgraph_rl import RunLog, learn_curriculum
 from ctgraph_rl.learn.refusals import notes
 from ctgraph_rl.learn.stacked import why_not_together
 from ctgraph_rl.log.scores import scores
+from ctgraph_rl.report.terminal import print_summary
 from ctgraph_rl.runs.config import composed
 from ctgraph_rl.runs.job import build, curriculum_of
 from ctgraph_rl.runs.read import read_run
@@ -210,6 +212,13 @@ def test_tables_of_a_life_have_windows_in_place_of_tasks(tmp_path):
     assert all(math.isnan(value) for value in run.windows("retention_100"))
     assert [curve[-1][0] for curve in run.history.training.values()][:3] == [2 * 64, 4 * 64, 5 * 64]
     assert [len(curve) for curve in run.history.training.values()] == [2, 2, *[1] * 8]
+    assert run.metrics["never_adapted"]["value"] == 1.0
+    console = Console(width=80, record=True)
+    print_summary(tmp_path, console)
+    printed = console.export_text()
+    assert "…" not in printed
+    assert ">= 64.00" in printed and ">= 0.00" not in printed
+    assert "adaptation frames: at least; 100% of tasks never reach 0.9" in printed
 
 
 @pytest.mark.parametrize(("most", "expected"), [(3, 1), (4, 0)])

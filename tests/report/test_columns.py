@@ -140,3 +140,25 @@ def test_curricula_without_a_return_have_no_regain():
 
     reason = "the definition needs a block of one task that was trained before, with other tasks between"
     assert recorder.metrics["regain"].undefined == reason
+
+
+def printed(run_dir, width: int = 80) -> str:
+    console = Console(width=width, record=True)
+    print_summary(run_dir, console)
+    return console.export_text()
+
+
+def test_a_run_that_keeps_its_only_task_says_how_many_it_learned(tmp_path):
+    """It forgets nothing, which reads as success."""
+    learned = in_blocks(A, B, C)
+    record(tmp_path, learned, policy(*[1] * 13), "kept")
+    record(tmp_path, learned, policy(*[1] * 5, *[2] * 4, *[3] * 4), "forgot")
+    said = "1 of 3 tasks were learned in their blocks; no other can be forgotten"
+
+    kept = line(table(all_runs([tmp_path / "kept"])), "forgetting", "kept")
+    forgot = line(table(all_runs([tmp_path / "forgot"])), "forgetting", "forgot")
+
+    assert (kept.estimate.value, forgot.estimate.value) == (0, 1)
+    assert f"seed 0: {said}" in kept.note and "were learned" not in forgot.note
+    assert f"forgetting: {said}" in printed(tmp_path / "kept" / "0")
+    assert "were learned" not in printed(tmp_path / "forgot" / "0")
