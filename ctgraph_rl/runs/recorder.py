@@ -86,8 +86,8 @@ class Recorder:
         checkpoint_seconds: time between two checkpoints within a block, >= 0.
 
     Raises:
-        ValueError: before anything is written: for values out of range, to resume a run of other settings or changed
-            code, and for a learner and seed that a folder beside this one has.
+        ValueError: before anything is written: for values out of range, or to resume a run of other settings or changed
+            code.
         FileExistsError: if the directory holds a run, without ``overwrite`` or ``resume``.
         BlockingIOError: if another writer is there, such as an open recorder.
 
@@ -185,7 +185,7 @@ class Recorder:
             fix = "choose another run_dir, or overwrite=True to replace it" + ", or resume=True" * (begun is not None)
             raise FileExistsError(f"{path} exists and is of {what}: {fix}")
         if begun is None:
-            self._check_new(run_dir)
+            self._note_twin(run_dir)
         if resume and begun is not None:
             self._check_same(begun)
             if not stopped and is_whole(run_dir):
@@ -206,14 +206,14 @@ class Recorder:
                 shutil.rmtree(run_dir / FOLDER, ignore_errors=True)
         self._member.begin(state)
 
-    def _check_new(self, run_dir: Path) -> None:
+    def _note_twin(self, run_dir: Path) -> None:
         ours = self._member.about
         for path in sorted(run_dir.parent.glob(f"*/{LOG}")):
             other = RunLog.begun(path) or {}
-            is_same = all(other.get(key) == ours[key] for key in ("fingerprint", "config"))
-            seed = ours["config"]["seed"]
-            named = f'seed={seed + 1}, or name another learner by about={{"learner": "NAME"}}'
-            require((not is_same, f"{path.parent} is seed {seed} of the same learner: give this run {named}"))
+            if path.parent != run_dir and all(other.get(key) == ours[key] for key in ("fingerprint", "config")):
+                seed = f"{path.parent} has seed {ours['config']['seed']} of the same learner, so tables count one"
+                print(f"note: {seed}: give this run another seed, or about={{'learner': NAME}}")
+                return
 
     def _check_same(self, begun: Mapping[str, Any]) -> None:
         before = begun.get("fingerprint")

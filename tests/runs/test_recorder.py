@@ -95,6 +95,14 @@ def test_a_missing_evaluation_makes_what_needs_it_undefined():
     assert recorder.metrics["backward_transfer"].undefined
 
 
+def test_a_seed_that_a_run_beside_it_has_is_noted(tmp_path, capsys):
+    for name, given in (("0", {}), ("1", {}), ("2", {"seed": 2}), ("3", {"about": {"learner": "another"}})):
+        Recorder(TASKS, tmp_path / name, **given).close()
+
+    (note,) = capsys.readouterr().out.splitlines()
+    assert note.startswith(f"note: {tmp_path / '0'} has seed 0 of the same learner, so tables count one: give this run")
+
+
 def test_frames_must_grow_and_a_log_is_not_overwritten(tmp_path):
     recorder = Recorder(TASKS, tmp_path)
     recorder.evaluate(table(1), 12)
