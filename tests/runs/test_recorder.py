@@ -99,7 +99,7 @@ def test_a_seed_that_a_run_beside_it_has_is_noted(tmp_path, capsys):
     for name, given in (("0", {}), ("1", {}), ("2", {"seed": 2}), ("3", {"about": {"learner": "another"}})):
         Recorder(TASKS, tmp_path / name, **given).close()
 
-    (note,) = capsys.readouterr().out.splitlines()
+    [note] = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note")]
     assert note.startswith(f"note: {tmp_path / '0'} has seed 0 of the same learner, so tables count one: give this run")
 
 

@@ -303,7 +303,7 @@ def test_lists_and_dictionaries_can_be_swept(learned, monkeypatch):
     settings = [json.loads((path / "run.jsonl").read_text())["config"] for path in learned]
     assert code == 0
     found = [(cfg["curriculum"]["goals"], cfg["evaluation"]["every"], cfg["evaluation"]["greedy"]) for cfg in settings]
-    two = [(goals, *evaluation) for goals in ([[1, 1]], [[1, 2], [2, 1]]) for evaluation in ((512, None), (None, True))]
+    two = [(goals, *evaluation) for goals in (["1.1"], ["1.2", "2.1"]) for evaluation in ((512, None), (None, True))]
     assert found == two
 
 
