@@ -20,8 +20,13 @@ class Reader(NamedTuple):
 
     weight: Tensor
     bias: Tensor
-    columns: Tensor
-    """The inputs of each unit, int64 [units, k]: several for a channel, and for a unit read at several steps."""
+    inputs: Tensor
+    """Those of each unit, int64 [units, k]: several for a channel, and for a unit read at several steps."""
+
+    @property
+    def columns(self) -> Tensor:
+        """The inputs, on the device of the weights, which can move."""
+        return self.inputs.to(self.weight.device)
 
 
 class HiddenLayer(NamedTuple):
@@ -39,7 +44,7 @@ class HiddenLayer(NamedTuple):
     @property
     def num_units(self) -> int:
         """Number of units."""
-        return len(self.readers[0].columns)
+        return len(self.readers[0].inputs)
 
     @property
     def norm(self) -> nn.LayerNorm | None:

@@ -68,7 +68,9 @@ def exact_measures(
     Raises:
         ValueError: lists the reasons why there are no exact measures.
     """
-    start = {} if initial_state is None else dict(initial_state(1).items())
+    start = {}
+    if initial_state is not None:
+        start = {key: value.cpu() for key, value in initial_state(1).items()}
     require(*exact_rules(policy, task, start))
     assert isinstance(task, Task)  # as the rules say
     shown = ShownTask(task, tuple(task.observation_shape if shape is None else shape), task_id)
@@ -228,6 +230,14 @@ class ShownTask:
         return data
 
 
+def _action_probs(policy: Any, data: Step) -> tuple[Tensor, Step]:
+    """Return what a policy says of data, on the CPU; its weights can be elsewhere."""
+    weights = next(policy.parameters(), None) if isinstance(policy, nn.Module) else None
+    device = None if weights is None else weights.device
+    probs, written = policy.action_probs({key: value.to(device) for key, value in data.items()})
+    return probs.cpu(), {key: value.cpu() for key, value in written.items()}
+
+
 def _table(policy: Any, task: Task, shown: ShownTask) -> Tensor:
     """Return action probabilities, float64 [num_images, A]: means over the views of an id.
 
@@ -237,7 +247,7 @@ def _table(policy: Any, task: Task, shown: ShownTask) -> Tensor:
     ids = torch.cat([torch.arange(first, last + 1, device="cpu") for first, last in (x.wait_ids, x.decision_ids)])
     views = _num_views(task)
     rows = (ids.unsqueeze(1) * views + torch.arange(views, device="cpu")).flatten()
-    probs, _ = policy.action_probs(shown.data(shown.bank.index_select(0, rows), False))
+    probs, _ = _action_probs(policy, shown.data(shown.bank.index_select(0, rows), False))
     table = torch.full([task.images.num_images, probs.shape[1]], 1 / probs.shape[1], dtype=torch.float64, device="cpu")
     table[ids] = probs.double().view(len(ids), views, -1).mean(1)
     return table
@@ -351,7 +361,7 @@ class _Enumeration:
         seen = histories.select(rows)
         seen.weight = seen.weight / images.shape[1]
         data = self.shown.data(self.bank.index_select(0, images.flatten()), is_init)
-        probs, written = self.policy.action_probs({**data, **seen.state})
+        probs, written = _action_probs(self.policy, {**data, **seen.state})
         return seen, probs.double(), written
 
     def _after(self, seen: _Histories, written: Step, chance: Tensor, action: int) -> _Histories:

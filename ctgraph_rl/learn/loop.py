@@ -204,7 +204,7 @@ class Lockstep:
         self.last_frames = curriculum.frames_of(until)
         self.last_learned = curriculum.frames_of(freeze_after)
         self.meters: list[UnitMeter] = []
-        if log_units:
+        if log_units is not False:
             for agent, log in zip(group.agents, logs, strict=True):
                 self.meters.append(UnitMeter(curriculum, agent, log, log_units))
         self.env = self._make_env(device)

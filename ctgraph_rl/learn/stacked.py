@@ -42,6 +42,7 @@ def learn_together(
     device: torch.device | str = "cpu",
     saved: Sequence[SavedState] | None = None,
     checkpoint: OfferCheckpoints | None = None,
+    log_units: bool | str = False,
 ) -> dict[int, FloatingPointError]:
     """Let agents with different seeds learn a curriculum as `learn_curriculum` lets one.
 
@@ -53,6 +54,7 @@ def learn_together(
         progress: updated after every batch with the mean return of all seeds.
         saved: all states that ``checkpoint`` was given, to resume with the same bits.
         checkpoint: is offered the states after every batch.
+        log_units: as for `learn_curriculum`.
 
     Returns:
         The error of each failed seed by its position in ``seeds``; names the seed, block and frames.
@@ -61,7 +63,7 @@ def learn_together(
         ValueError: before any work, as `learn_curriculum` does.
     """
     device = checked_device(device)
-    members = Lockstep(curriculum, group, seeds, logs, device=device, saved=saved)
+    members = Lockstep(curriculum, group, seeds, logs, device=device, saved=saved, log_units=log_units)
     with closing(members):
         run_loop(members, progress, checkpoint)
     return members.failed

@@ -133,8 +133,12 @@ def fresh_images(task: Task) -> Tensor | None:
     return PaperImages(NUM_FRESH, FRESH_SEED, task.images.size).bank(0)
 
 
-def unit_rules(curriculum: Curriculum, agent: Agent) -> Iterator[Rule]:
-    """Yield what metrics of units require."""
+def unit_rules(curriculum: Curriculum, agent: Agent, when: bool | str) -> Iterator[Rule]:
+    """Yield what ``log_units`` requires: True, `EACH_BATCH`, or False, which measures nothing."""
+    if when is False:
+        return
+    named = when is True or when == EACH_BATCH
+    yield named, f"log_units must be True, False or {EACH_BATCH!r}, got {when!r}"
     off = "set log_units=false"
     kind = type(curriculum.examples[0]).__name__
     yield are_graphs(curriculum.examples), f"log_units needs CT-graphs, whose images are known, got {kind}: {off}"
@@ -155,9 +159,7 @@ class UnitMeter:
     """
 
     def __init__(self, curriculum: Curriculum, agent: Agent, log: RunLog, when: bool | str) -> None:
-        named = when is True or when == EACH_BATCH
-        require((named, f"log_units must be True, False or {EACH_BATCH!r}, got {when!r}"))
-        require(*unit_rules(curriculum, agent))
+        require(*unit_rules(curriculum, agent, when))
         self.curriculum = curriculum
         self.agent = agent
         self.log = log
@@ -183,6 +185,8 @@ class UnitMeter:
     @torch.no_grad()
     def _activations(self, images: Tensor, task: Task) -> LayersByName:
         data = ShownTask(task, self._shape, shown_id(self.curriculum, task)).data(images, True)
+        device = next(self.agent.policy.parameters()).device
+        data = {key: value.to(device) for key, value in data.items()}
         data |= self.agent.initial_state(len(images)).items()
         learner: Any = getattr(self.agent, "unwrapped", self.agent)
         return learner.activations(data)

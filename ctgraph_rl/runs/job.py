@@ -99,11 +99,10 @@ def build(
     """
     curriculum, make_agent = recipe_of(cfg) if recipe is None else recipe
     member = make_member(cfg, run_dir, curriculum, make_agent, settings=config.plain(cfg), interrupt=interrupt)
-    usual = bool(cfg.get("plasticity")) and all(holds for holds, _ in unit_rules(curriculum, member.agent))
+    usual = bool(cfg.get("plasticity")) and all(holds for holds, _ in unit_rules(curriculum, member.agent, True))
     check_share(curriculum, member.agent, cfg.objective_until)
     member.log_units = usual if cfg.log_units is None else cfg.log_units
-    if member.log_units:
-        require(*unit_rules(curriculum, member.agent))
+    require(*unit_rules(curriculum, member.agent, member.log_units))
     return member
 
 

@@ -26,6 +26,7 @@ from ctgraph_rl.learn.collective import Member
 from ctgraph_rl.learn.loop import Alone, Group, Lockstep, run_loop
 from ctgraph_rl.learn.progress import ProgressBar
 from ctgraph_rl.learn.refusals import check_ids, check_rows
+from ctgraph_rl.learn.unit_metrics import unit_rules
 from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, FAILURE, LOG, METRICS, Locks
@@ -239,6 +240,7 @@ class OneBatch(SessionCoupling):
         agent = members[0].agent
         check_rows(curriculum, agent.num_envs)
         check_ids(curriculum, agent)
+        require(*unit_rules(curriculum, agent, members[0].log_units))
         for each in members:
             each.checkpoints.tidy()
         begun = [each for each in members if each.checkpoints.files()]

@@ -125,6 +125,7 @@ def train(
     checkpoints: Checkpoints | None = None,
     listeners: Sequence[Callable[[NamedValues], object]] = (),
     console: Console | None = None,
+    log_units: bool | str = False,
 ) -> None:
     """Let a new agent learn a curriculum, with a progress bar, and write `RESULTS`.
 
@@ -137,6 +138,7 @@ def train(
         experts: each task's single-task expert, named in the log.
         checkpoints: default: in the directory, every five minutes.
         listeners: called with every measurement.
+        log_units: as for `learn_curriculum`.
 
     Raises:
         ValueError: before any work, for arguments out of range, an agent that cannot learn the curriculum, and a run
@@ -174,6 +176,7 @@ def train(
         sources=learners(config, agent),
         experts=experts,
         listeners=list(listeners),
+        log_units=log_units,
     )
     with Session(console) as session:
         session.lock(run_dir)

@@ -262,6 +262,26 @@ def test_a_goal_that_changes_and_what_is_no_policy_have_no_exact_measures():
         exact_success(None, ct_su_b1())
 
 
+class Elsewhere(nn.Module):
+    """Has its weights on another device, and a state."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(1, device="meta"))
+
+    def action_probs(self, data):
+        assert {value.device.type for value in data.values()} == {"meta"}
+        probs = uniform(data["observation"])
+        return probs, {("next", "state"): torch.zeros(len(probs), 1)} if "state" in data else {}
+
+
+@pytest.mark.parametrize("state", [None, lambda count: {"state": torch.zeros(count, 1)}])
+def test_images_and_states_are_where_the_weights_are(state):
+    found = exact_measures(Elsewhere(), ct_su_b1(), greedy=False, initial_state=state)
+
+    assert found.success_rate == pytest.approx(1 / 243)
+
+
 def test_adaptation_is_not_exact():
     with pytest.raises(ValueError, match="exact must be false with adapt_episodes=3"):
         Evaluation(exact=True, adapt_episodes=3)

@@ -12,11 +12,15 @@ import torch
 from torch import Tensor
 
 import curricula
+from baselines.exchanges.isolated import Isolated
 from baselines.lstm_ppo import LSTMPPO
 from baselines.ppo import PPO
+from baselines.update.seeds import SeedGroup
 from ctgraph_rl import Block, Curriculum, Evaluation
 from ctgraph_rl.learn.collect import agent_specs
+from ctgraph_rl.learn.collective import Member, learn_collective
 from ctgraph_rl.learn.lifelong import learn_curriculum
+from ctgraph_rl.learn.stacked import learn_together
 from ctgraph_rl.learn.unit_metrics import (
     NUM_FRESH,
     UnitMeter,
@@ -27,6 +31,7 @@ from ctgraph_rl.learn.unit_metrics import (
 )
 from ctgraph_rl.log.measurement import without_time
 from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.runs.train import train
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_su_b1
 from ctgraph_rl.tasks.images import OneHot
 
@@ -251,6 +256,47 @@ def test_each_batch_is_measured_where_asked_and_learning_keeps_its_bits():
         assert without_time(line).items() <= measured.items()
         assert measured["norm_gradients"] == line["grad_norm"]
         assert measured["norm_updates"] > 0
+
+
+def units_of(log: RunLog) -> list:
+    return [without_time(line) for line in log.of_kind("units")]
+
+
+def test_runs_seeds_together_and_collectives_measure_units_as_one_agent_alone(tmp_path):
+    units = units_of(learn_curriculum(SHORT, learner(), log_units=True))
+
+    train(SHORT, learner(), tmp_path, 0, log_units=True)
+    assert units_of(RunLog.read(tmp_path / "run.jsonl")) == units
+
+    agent = learner()
+    log = RunLog()
+    group = SeedGroup([agent], [torch.Generator().set_state(torch.get_rng_state())])
+    learn_together(SHORT, group, [0], [log], log_units=True)
+    assert units_of(log)[:2] == units[:2] and len(log.of_kind("units")) == len(units)
+
+    members = [Member(SHORT, learner(), log_units=True), Member(SHORT, learner(), 1)]
+    learn_collective(members, Isolated(2, 1, 0.0, 0.0))
+    assert [units_of(member.log) for member in members] == [units, []]
+
+
+def test_a_run_that_cannot_measure_units_is_refused_before_it_is_begun(tmp_path):
+    with pytest.raises(ValueError, match="log_units must be True, False or 'batch', got 'block'"):
+        train(SHORT, learner(), tmp_path, 0, log_units="block")
+    with pytest.raises(ValueError, match="log_units must be True, False or 'batch', got 0"):
+        learn_curriculum(SHORT, learner(), log_units=0)
+
+    assert not (tmp_path / "run.jsonl").exists()
+
+
+def test_a_meter_shows_images_where_the_weights_are():
+    agent = Zeros()
+    agent.policy.to("meta")
+    shown = []
+    agent.activations = lambda data: shown.append(data) or Zeros().activations({"observation": torch.ones(3, 1)})
+
+    UnitMeter(SHORT, agent, RunLog(), True).measure(1, 0, "start")
+
+    assert {value.device.type for data in shown for value in data.values()} == {"meta"}
 
 
 def test_a_resumed_run_measures_units_as_if_it_had_never_stopped():

@@ -18,6 +18,7 @@ from baselines.plasticity.redo import ReDo
 from baselines.plasticity.shrink_and_perturb import ShrinkAndPerturb
 from baselines.update.seeds import SeedGroup
 from ctgraph_rl import Block, Evaluation, Protocol, RunLog, learn_curriculum
+from ctgraph_rl.learn.collect import agent_specs
 from ctgraph_rl.learn.stacked import learn_together
 from ctgraph_rl.runs import config
 from ctgraph_rl.runs.job import make_agent
@@ -207,6 +208,8 @@ def test_agents_and_changes_that_do_not_fit_are_refused_by_name(compose):
         fire().attach(small(compose, "ppo"), hidden)
     with pytest.raises(ValueError, match="ReDo acts on hidden units, and MOHQA has none"):
         redo().attach(small(compose, "mohqa"), TWO_BLOCKS)
+    with pytest.raises(ValueError, match="FIRE acts where a task starts, and PEARL draws its tasks"):
+        fire().attach(made(compose, "agent", "pearl")(*agent_specs(TWO_BLOCKS)), TWO_BLOCKS)
     with pytest.raises(ValueError, match=r"UPGD is an optimiser .* set agent\.compile=false"):
         upgd().attach(small(compose, "ppo", (ONE,), "agent.compile=true"), TWO_BLOCKS)
     with pytest.raises(ValueError, match="plasticity_settings are those of a plasticity: give plasticity=NAME, too"):

@@ -33,6 +33,16 @@ def test_a_neutral_setting_changes_no_bit(compose, name):
     assert equal(plain, learned(plastic(compose, NEUTRAL[name](), "a2c")))
 
 
+def test_the_inputs_of_units_are_where_the_weights_have_moved(compose):
+    torch.__future__.set_swap_module_params_on_conversion(True)
+    try:
+        agent = plastic(compose, NEUTRAL["redo"]()).to("meta")
+    finally:
+        torch.__future__.set_swap_module_params_on_conversion(False)
+
+    assert {reader.columns.device.type for layer in agent.plasticity.layers for reader in layer.readers} == {"meta"}
+
+
 def with_redo(compose, threshold: float, *agent: str, reset_moments: bool = True) -> tuple:
     """An agent that has learned from a batch, and acts from the next step on; and a minibatch."""
     made = plastic(compose, ReDo(threshold, NEVER, reset_moments=reset_moments), *agent)
