@@ -16,13 +16,9 @@ from ctgraph_rl.board.rerun import Rerun, RerunCell, check_of_scores, job_of, sc
 from ctgraph_rl.board.rescore import Check, of_the_protocol
 from ctgraph_rl.board.submission import Submission
 from ctgraph_rl.board.tracks import HELD_OUT_SEEDS, drawn, held_out_seeds
-from ctgraph_rl.disk import make_folder, write_whole
 from ctgraph_rl.log.escape import terminal_text
-from ctgraph_rl.log.files import CURRICULUM
-from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.parsers import LEVELS
 from ctgraph_rl.tasks.curriculum import Curriculum
-from ctgraph_rl.tasks.curriculum_json import file_text
 from ctgraph_rl.tasks.kinds.task_like import TaskLike
 from ctgraph_rl.tasks.task import Task
 
@@ -30,25 +26,25 @@ HELD_OUT = LEVELS[2]
 
 
 def seeds_of(submission: Submission, number: int, count: int) -> tuple[int, ...]:
-    """Return the seeds that a verifier's number draws, by the track's rule or from `HELD_OUT_SEEDS`."""
-    if submission.track is not None:
-        return submission.track.draw_held_out_seeds(submission.digest, number, count)
-    return held_out_seeds(f"{submission.digest} {number}", count)
+    """Return different seeds that a verifier's number draws.
+
+    Neither side can pick them: the submitter does not know the number, the verifier does not choose the digest.
+    """
+    of_track = "" if submission.track is None else f"{submission.track.id} "
+    return held_out_seeds(f"{of_track}{submission.digest} {number}", count)
 
 
 def held_out_cells(submission: Submission, number: int, count: int, folder: Path) -> list[RerunCell]:
     """Return what is learned: one seed each, with other images and goals, and the submitted configuration.
 
-    Each has a folder within ``folder`` with its curriculum's file.
+    Each has a folder within ``folder``.
     """
     cells = []
     first = submission.finished[0]
     for seed in seeds_of(submission, number, count):
-        own = make_folder(folder / f"seed{seed}").resolve()
         curriculum = other_curriculum(submission.curriculum, f"{submission.digest} {number} {seed}")
-        write_whole(own / CURRICULUM, file_text(curriculum.to_json()))
-        job = job_of(submission, (seed,), first, own / CURRICULUM)
-        cells.append(RerunCell(own, job, (), curriculum, seconds=first.seconds))
+        job = job_of(submission, (seed,), first)
+        cells.append(RerunCell(folder / f"seed{seed}", job, (), curriculum, seconds=first.seconds))
     return cells
 
 
@@ -63,20 +59,16 @@ def held_out_checks(submission: Submission, results: Sequence[tuple[RerunCell, R
         try:
             if result.log is not None:
                 value = score_of(result.log, cell.curriculum, name)
-                yield from _of_the_protocol(submission, cell.curriculum, seed, result.log)
+                for check in of_the_protocol(cell.curriculum, seed, result.log, f"seed {seed}"):
+                    yield check._replace(level=HELD_OUT)
         except ValueError as error:
             failure = str(error)
         if failure is not None:
             yield Check(f"run of seed {seed}", "it finishes", terminal_text(failure), None, level=HELD_OUT)
-        found += [] if value is None else [value]
+        if value is not None:
+            found.append(value)
     what = f"{name} of {len(found)} runs with other seeds, images and goals"
     yield check_of_scores(submission, found, what, HELD_OUT)
-
-
-def _of_the_protocol(submission: Submission, curriculum: Curriculum, seed: int, log: RunLog) -> list[Check]:
-    run = replace(submission.finished[0], seed=seed, run=f"seed {seed}")
-    checks = of_the_protocol(replace(submission, curriculum=curriculum), run, log)
-    return [check._replace(level=HELD_OUT) for check in checks]
 
 
 def other_curriculum(curriculum: Curriculum, key: str) -> Curriculum:

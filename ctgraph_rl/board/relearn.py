@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 from omegaconf import DictConfig
 
-from ctgraph_rl.checks import NamedValues, ReadOnlyValues, require
+from ctgraph_rl.checks import ReadOnlyValues, require
 from ctgraph_rl.disk import write_whole
 from ctgraph_rl.runs import config
 from ctgraph_rl.runs.job import run_as_one, run_job
@@ -33,7 +33,7 @@ class Relearning(NamedTuple):
     config: ReadOnlyValues  # without the seed
     num_threads: int
     entry_point: str | None  # module:function of a learner that is not ours
-    curriculum: str | None  # file of what it learns; None: what the configuration says
+    curriculum: str | None = None  # file of what it learns; None: what the configuration says
 
     def write(self, path: Path) -> None:
         """Write the job to a file."""
@@ -59,11 +59,20 @@ def learn_again(job: Relearning, folder: Path) -> None:
     """
     run_dirs = [run_dir_of(folder, seed) for seed in job.seeds]
     if job.entry_point is not None:
-        _call(job, run_dirs[0])
+        module, _, name = job.entry_point.partition(":")
+        function = getattr(import_module(module), name, None)
+        require((callable(function), f"entry_point {job.entry_point}: {module} has no function {name}"))
+        torch.set_num_threads(job.num_threads)
+        function(Curriculum.from_json(str(job.curriculum)), job.seeds[0], run_dirs[0])  # type: ignore[misc]
         return
-    runs = [(configuration(_settings(job, seed)), run_dir) for seed, run_dir in zip(job.seeds, run_dirs, strict=True)]
-    for run_dir in run_dirs:
+    runs = []
+    for seed, run_dir in zip(job.seeds, run_dirs, strict=True):
         run_dir.mkdir(exist_ok=True)
+        settings = {**job.config, "seed": seed}
+        if job.curriculum is not None:
+            target = "ctgraph_rl.tasks.curriculum.Curriculum.from_json"
+            settings["curriculum"] = {"_target_": target, "path_or_dict": job.curriculum}
+        runs.append((configuration(settings), run_dir))
     if job.together:
         run_as_one(runs)
     else:
@@ -75,24 +84,6 @@ def configuration(stored: ReadOnlyValues) -> DictConfig:
     settings = dict(config.composed([]))
     settings |= {key: with_added(value) if isinstance(value, Mapping) else value for key, value in stored.items()}
     return DictConfig(settings)
-
-
-def _settings(job: Relearning, seed: int) -> NamedValues:
-    target = "ctgraph_rl.tasks.curriculum.Curriculum.from_json"
-    own = {} if job.curriculum is None else {"curriculum": {"_target_": target, "path_or_dict": job.curriculum}}
-    return {**job.config, "seed": seed, **own}
-
-
-def _call(job: Relearning, run_dir: Path) -> None:
-    module, _, name = str(job.entry_point).partition(":")
-    function = getattr(import_module(module), name, None)
-    require(
-        (callable(function), f"entry_point {job.entry_point}: {module} has no function {name}"),
-        (job.curriculum is not None, "an entry point needs the file of a curriculum"),
-    )
-    assert callable(function)
-    torch.set_num_threads(job.num_threads)
-    function(Curriculum.from_json(str(job.curriculum)), job.seeds[0], run_dir)
 
 
 if __name__ == "__main__":

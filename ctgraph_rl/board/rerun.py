@@ -38,8 +38,6 @@ from ctgraph_rl.tasks.curriculum_json import file_text
 
 RERUN = LEVELS[1]
 
-MODULE = "ctgraph_rl.board.relearn"
-
 JOB = "job.json"
 
 SCORE = "average_performance"
@@ -74,11 +72,6 @@ class RerunCell(NamedTuple):
         """The run directory of each seed."""
         return [run_dir_of(self.folder, seed) for seed in self.job.seeds]
 
-    @property
-    def is_finished(self) -> bool:
-        """Whether all seeds have results."""
-        return all((run_dir / METRICS).is_file() for run_dir in self.run_dirs)
-
 
 class Rerun(NamedTuple):
     """What a seed that was learned again left."""
@@ -111,23 +104,19 @@ def cells_of(submission: Submission, drawn: Sequence[SubmittedRun], folder: Path
     return cells
 
 
-def job_of(
-    submission: Submission, seeds: tuple[int, ...], run: SubmittedRun, curriculum: Path | None = None
-) -> Relearning:
+def job_of(submission: Submission, seeds: tuple[int, ...], run: SubmittedRun) -> Relearning:
     """Return the job of seeds with the submitted configuration.
 
     Args:
         seeds: one, or those of a group.
         run: a submitted run, whose number of threads counts.
-        curriculum: file of another curriculum; None: the submitted one.
     """
     entry = submission.method["entry_point"]
     cores = os.cpu_count() or 1
     few = f"{run.run} had {run.num_threads} threads, this machine has {cores} cores: verify it on a larger one"
     require((entry is not None or run.num_threads <= cores, few))
-    path = None if curriculum is None else str(curriculum)
     together = bool(run.group) and len(seeds) > 1
-    return Relearning(seeds, together, submission.config, run.num_threads, entry_point=entry, curriculum=path)
+    return Relearning(seeds, together, submission.config, run.num_threads, entry_point=entry)
 
 
 def learn_again(cell: RerunCell, limits: Limits, isolated: Isolation, code: Sequence[Path] = ()) -> Outcome:
@@ -136,7 +125,7 @@ def learn_again(cell: RerunCell, limits: Limits, isolated: Isolation, code: Sequ
     Modules of others are looked for in ``code``.
     """
     make_folder(cell.folder)
-    if cell.is_finished:
+    if all((run_dir / METRICS).is_file() for run_dir in cell.run_dirs):
         return Outcome(0, None, "")
     if cell.job.entry_point is not None:
         for run_dir in cell.run_dirs:
@@ -146,13 +135,13 @@ def learn_again(cell: RerunCell, limits: Limits, isolated: Isolation, code: Sequ
                 fix = "has too many folders within each other to remove: rm -r it yourself"
                 raise ValueError(f"{run_dir} {fix}") from None
     job = cell.job
-    if job.curriculum is not None or job.entry_point is not None:  # a file in its folder, where its process sees it
+    if job.entry_point is not None or not cell.runs:  # else the configuration says what is learned
         file = cell.folder.resolve() / CURRICULUM
         write_whole(file, file_text(cell.curriculum.to_json()))
         job = job._replace(curriculum=str(file))
     job.write(cell.folder / JOB)
     found_in = [path.resolve() for path in code]
-    command = [sys.executable, "-P", "-s", "-m", MODULE, JOB, *map(str, found_in)]
+    command = [sys.executable, "-P", "-s", "-m", "ctgraph_rl.board.relearn", JOB, *map(str, found_in)]
     variables = {"PYTHONPATH": str(home()), "PYTHONDONTWRITEBYTECODE": "1"}
     if is_portable(cell.job.config):
         variables |= VARIABLES

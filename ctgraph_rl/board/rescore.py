@@ -139,15 +139,14 @@ def _of_the_log(submission: Submission, run: SubmittedRun, log: RunLog) -> Itera
     stored = about.get("machine"), about.get("num_threads"), about.get("cpu")
     yield equal("machine", (run.machine, run.num_threads, run.cpu or None), stored, run.run)
     if run.finished:
-        yield from of_the_protocol(submission, run, log)
+        yield from of_the_protocol(submission.curriculum, run.seed, log, run.run)
 
 
-def of_the_protocol(submission: Submission, run: SubmittedRun, log: RunLog) -> Iterator[Check]:
+def of_the_protocol(curriculum: Curriculum, seed: int, log: RunLog, run: str) -> Iterator[Check]:
     """Yield checks that a log has all evaluations of the protocol and all frames of the curriculum."""
-    curriculum = submission.curriculum
-    how = submission.curriculum.evaluation
-    yield equal("frames", curriculum.num_frames, log.ends()[-1], run.run)
-    tasks_at = Evaluator(curriculum, run.seed, log).tasks_at
+    how = curriculum.evaluation
+    yield equal("frames", curriculum.num_frames, log.ends()[-1], run)
+    tasks_at = Evaluator(curriculum, seed, log).tasks_at
     wanted = []
     for at in curriculum.moments:
         for number, _ in tasks_at(at).values():
@@ -157,7 +156,7 @@ def of_the_protocol(submission: Submission, run: SubmittedRun, log: RunLog) -> I
     for what, some in (("missing", {*wanted} - {*there}), ("more", {*there} - {*wanted})):
         if some:
             notes.append(f"{what} (frames, task, episodes): {listed(sorted(some, key=str))}")
-    yield Check("evaluations", str(len(wanted)), str(len(there)), wanted == there, run.run, note="; ".join(notes))
+    yield Check("evaluations", str(len(wanted)), str(len(there)), wanted == there, run, note="; ".join(notes))
 
 
 # rules of a submission, pairs of (holds, message)

@@ -207,14 +207,16 @@ def _curriculum(content: ReadOnlyValues, of_track: Track | None) -> Curriculum:
     tasks = content.get("tasks")
     if not isinstance(tasks, list) or not any(isinstance(task, dict) and "type" in task for task in tasks):
         return Curriculum.from_json(content)
-    known = [curriculum_named(str(content.get("name")))] if of_track is None else []
-    for variant in () if of_track is None else of_track.variants:
-        known.append(variant.curriculum)
-    same = [curriculum for curriculum in known if curriculum.fingerprint == content.get("fingerprint")]
-    where = "published" if of_track is None else f"of track {of_track.id}"
-    message = f"curriculum has tasks that are no CT-graphs, and is not {where}: its environments are not made"
-    require((bool(same), message))
-    return same[0]
+    if of_track is None:
+        where = "published"
+        known = [curriculum_named(str(content.get("name")))]
+    else:
+        where = f"of track {of_track.id}"
+        known = [variant.curriculum for variant in of_track.variants]
+    for curriculum in known:
+        if curriculum.fingerprint == content.get("fingerprint"):
+            return curriculum
+    raise ValueError(f"curriculum has tasks that are no CT-graphs, and is not {where}: its environments are not made")
 
 
 def _check_fields(given: Any, kinds: Mapping[str, Kind], what: str, owner: str = "") -> None:

@@ -18,7 +18,7 @@ from typing import Any
 
 import yaml
 
-from ctgraph_rl.checks import ReadOnlyValues, at_least_one, did_you_mean, is_int, require
+from ctgraph_rl.checks import ReadOnlyValues, did_you_mean, require
 from ctgraph_rl.packages import conf_dir
 from ctgraph_rl.runs import config
 from ctgraph_rl.runs.job import with_changes
@@ -120,14 +120,6 @@ class Track:
     def variant_of(self, curriculum: Curriculum) -> Variant | None:
         """Return the variant with this curriculum, if any."""
         return self.by_fingerprint.get(curriculum.fingerprint)
-
-    def draw_held_out_seeds(self, digest: str, number: int, count: int) -> tuple[int, ...]:
-        """Return different seeds that follow from a submission and a verifier's number.
-
-        Neither side can pick them: the submitter does not know the number, the verifier does not choose the digest.
-        """
-        require((is_int(number, 0), f"number must be an integer >= 0, got {number!r}"), *at_least_one(count=count))
-        return held_out_seeds(f"{self.id} {digest} {number}", count)
 
     def _of_rung(self, rung: Sequence[str], composed: Any) -> Iterator[Variant]:
         cfg = deepcopy(composed)

@@ -29,8 +29,9 @@ from ctgraph_rl.board.rerun import RERUN, RerunCell, cells_of, draw, learn_again
 from ctgraph_rl.board.rescore import RESCORED, Check, rescore
 from ctgraph_rl.board.submission import MOST_RUNS, VERIFICATION, Submission, read_submission
 from ctgraph_rl.board.two_samples import runs_needed
+from ctgraph_rl.board.verification import SCHEMA, level_of, verification_of
 from ctgraph_rl.checks import NamedValues, Rule, is_int, is_real, require
-from ctgraph_rl.disk import make_folder, read_regular, write_whole
+from ctgraph_rl.disk import make_folder, write_whole
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
 from ctgraph_rl.log.files import locked
 from ctgraph_rl.log.provenance import is_ours, machine, targets, versions
@@ -39,13 +40,6 @@ from ctgraph_rl.packages import check_packages
 from ctgraph_rl.parsers import LEVELS, LIMIT_TIMES
 from ctgraph_rl.portable import cpu_model
 from ctgraph_rl.runs.sweep import sigterm_exits
-from ctgraph_rl.strict import json_value
-
-NONE = "none"
-
-SCHEMA = 1
-
-MOST_BYTES = 2**24
 
 LEAST_SECONDS = 600
 
@@ -212,23 +206,6 @@ def run_plan(plan: Plan) -> list[Check]:
     return [*checks, *held_out_checks(plan.submission, fresh)] if fresh else checks
 
 
-def level_of(checks: Sequence[Check]) -> str:
-    """Return the highest level up to which all checks passed.
-
-    Files or reruns that contradict the submission leave no level. An open question, or lower held-out scores, only keep
-    it from the next level.
-    """
-    reached = NONE
-    if any(check.passed is False and check.level != HELD_OUT for check in checks):
-        return NONE
-    for level in LEVELS:
-        own = [check.passed for check in checks if check.level == level]
-        if not own or not all(own):
-            break
-        reached = level
-    return reached
-
-
 def write_verification(submission: Submission, checks: Sequence[Check], plan: Plan | None = None) -> Path:
     """Write ``verification.json`` into a submission's folder; without a plan only files were checked."""
     drawn: list[str] = []
@@ -263,13 +240,8 @@ def check_stored(submission: Submission, level: str) -> None:
     Raises:
         ValueError: names the file and its level.
     """
+    stored = verification_of(submission).level
     path = submission.path / VERIFICATION
-    try:
-        found = json_value(read_regular(path, MOST_BYTES))
-    except (OSError, ValueError):
-        return
-    is_same = isinstance(found, dict) and found.get("digest") == submission.digest
-    stored = found.get("level") if is_same else NONE
     lower = f"{path} has the level {stored}, --level {level} would replace it: verify a copy of the folder"
     require((stored not in LEVELS[LEVELS.index(level) + 1 :], lower))
 

@@ -17,8 +17,9 @@ from ctgraph_rl import cli
 from ctgraph_rl.board import verify
 from ctgraph_rl.board.rescore import Check, rescore, scores_of
 from ctgraph_rl.board.standings.board_page import write_board
-from ctgraph_rl.board.standings.entries import make_entry, read_entries, verification_of
+from ctgraph_rl.board.standings.entries import make_entry, read_entries
 from ctgraph_rl.board.submission import VERIFICATION, log_name, log_sum, packed, read_submission
+from ctgraph_rl.board.verification import verification_of
 
 for package in ("jinja2", "scipy"):
     pytest.importorskip(package)

@@ -15,7 +15,7 @@ from helpers.submissions import edit, edit_run
 
 from ctgraph_rl import RunLog
 from ctgraph_rl.board import rerun, verify
-from ctgraph_rl.board.rescore import RESCORED, rescore, scores_of
+from ctgraph_rl.board.rescore import RESCORED, Check, rescore, scores_of
 from ctgraph_rl.board.submission import Submission, log_sum, packed, read_log, read_submission
 from ctgraph_rl.log import provenance
 
@@ -128,7 +128,7 @@ def test_the_command_writes_what_it_found_and_exits_with_1_where_something_diffe
     assert "all passed; level rescored" in capsys.readouterr().out
 
     path = submission.path / "verification.json"
-    path.write_text(text.replace('"level": "rescored"', '"level": "rerun"', 1))
+    verify.write_verification(submission, [Check("", "", "", True, level=level) for level in ("rescored", "rerun")])
     with pytest.raises(SystemExit, match="2"):
         verify.main()
     assert f"{path} has the level rerun, --level rescored would replace it" in capsys.readouterr().err

@@ -20,9 +20,10 @@ from ctgraph_rl.board.method_yaml import TEMPLATE
 from ctgraph_rl.board.standings import board_formats as formats
 from ctgraph_rl.board.standings.board_page import html
 from ctgraph_rl.board.standings.board_tables import BoardTable, tables
-from ctgraph_rl.board.standings.entries import BoardEntry, Verification
+from ctgraph_rl.board.standings.entries import BoardEntry
 from ctgraph_rl.board.standings.track_ceilings import ceilings_of
 from ctgraph_rl.board.tracks import Track, track
+from ctgraph_rl.board.verification import Verification
 from ctgraph_rl.report import statistics
 
 pytest.importorskip("scipy")

@@ -6,7 +6,7 @@ import pytest
 from helpers.sweeping import command_line
 
 import curricula
-from ctgraph_rl.board.tracks import HELD_OUT_SEEDS, TUNING_SEEDS, track, tracks
+from ctgraph_rl.board.tracks import HELD_OUT_SEEDS, TUNING_SEEDS, held_out_seeds, track, tracks
 from ctgraph_rl.metrics import METRICS
 from ctgraph_rl.runs.config import composed, plain
 from ctgraph_rl.runs.settings import digest
@@ -26,7 +26,7 @@ def test_there_are_these_tracks_and_the_small_one_is_the_first():
 def test_a_track_has_seeds_for_submissions_for_tuning_and_for_verifiers_apart_from_each_other(name):
     found = TRACKS[name]
 
-    drawn = found.draw_held_out_seeds("0a1b", number=7, count=5)
+    drawn = held_out_seeds(f"{found.id} 0a1b 7", count=5)
 
     assert len({*found.seeds, *TUNING_SEEDS, *drawn}) == len(found.seeds) + len(TUNING_SEEDS) + 5
     assert all(seed in HELD_OUT_SEEDS for seed in drawn)
@@ -88,17 +88,11 @@ def test_a_track_without_seed_is_a_sweep_over_its_seeds(monkeypatch, tmp_path, c
     assert "this configuration is a sweep, seed=range(20): add -m to run it" in capsys.readouterr().err
 
 
-def test_held_out_seeds_follow_from_track_submission_and_number():
-    found = TRACKS["small"]
-
-    assert found.draw_held_out_seeds("ab", 1, 3) == (1368827940, 586872641, 317709782)
-    assert found.draw_held_out_seeds("ab", 1, 2) == (1368827940, 586872641)
-    others = (found.draw_held_out_seeds("ac", 1, 3), found.draw_held_out_seeds("ab", 2, 3))
-    assert not {*found.draw_held_out_seeds("ab", 1, 3)} & {*others[0], *others[1]}
-    with pytest.raises(
-        ValueError, match="number must be an integer >= 0, got -1; count must be an integer >= 1, got 0"
-    ):
-        found.draw_held_out_seeds("ab", -1, 0)
+def test_held_out_seeds_follow_from_a_text():
+    assert held_out_seeds("small-v1 ab 1", 3) == (1368827940, 586872641, 317709782)
+    assert held_out_seeds("small-v1 ab 1", 2) == (1368827940, 586872641)
+    others = (held_out_seeds("small-v1 ac 1", 3), held_out_seeds("small-v1 ab 2", 3))
+    assert not {*held_out_seeds("small-v1 ab 1", 3)} & {*others[0], *others[1]}
 
 
 def test_an_unknown_track_is_refused_with_the_one_that_was_meant():

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 from ctgraph_rl import __version__
 from ctgraph_rl.board.standings.board_tables import BoardTable, Standing, is_significant
-from ctgraph_rl.board.standings.entries import LEVELS
 from ctgraph_rl.board.standings.track_ceilings import in_words
+from ctgraph_rl.board.verification import STATES
 from ctgraph_rl.checks import NamedValues
 from ctgraph_rl.log.escape import csv_text
 from ctgraph_rl.metrics import METRICS
@@ -53,7 +53,7 @@ def columns(line: Standing) -> list[BoardColumn]:
         BoardColumn("bytes of the agent", size, entry.agent_bytes),
         BoardColumn("steps", f"{entry.frames:,}", entry.frames),
         BoardColumn("hours", time, hours),
-        BoardColumn("level", entry.verified, LEVELS.index(entry.level)),
+        BoardColumn("level", entry.verified, STATES.index(entry.level)),
     ]
 
 

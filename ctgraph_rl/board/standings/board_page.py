@@ -13,7 +13,8 @@ from typing import NamedTuple
 from ctgraph_rl import __version__, parsers
 from ctgraph_rl.board.standings import board_formats as formats
 from ctgraph_rl.board.standings.board_tables import BoardTable, tables
-from ctgraph_rl.board.standings.entries import LEVELS, BoardEntry, read_entries, shown_level
+from ctgraph_rl.board.standings.entries import BoardEntry, read_entries, shown_level
+from ctgraph_rl.board.verification import STATES
 from ctgraph_rl.checks import require
 from ctgraph_rl.disk import make_folder, write_whole
 from ctgraph_rl.log.escape import terminal_text
@@ -75,8 +76,8 @@ def html(made: Sequence[BoardTable], problems: Sequence[Problem] = ()) -> str:
         tables=made,
         problems=problems,
         formats=formats,
-        levels=[(place, shown_level(level)) for place, level in enumerate(LEVELS)],
-        level_of=lambda entry: LEVELS.index(entry.level),
+        levels=[(place, shown_level(level)) for place, level in enumerate(STATES)],
+        level_of=lambda entry: STATES.index(entry.level),
         given=list(dict.fromkeys(table.variant.given for table in made)),
         link_of=link_of,
         version=__version__,

@@ -6,35 +6,20 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
 
-from ctgraph_rl.board import verify
-from ctgraph_rl.board.method_yaml import Kind, kind_rules, list_of, track_version
-from ctgraph_rl.board.rescore import Check, scores_of
-from ctgraph_rl.board.submission import SUBMISSION, VERIFICATION, Submission, read_submission
+from ctgraph_rl.board.method_yaml import track_version
+from ctgraph_rl.board.rescore import scores_of
+from ctgraph_rl.board.submission import SUBMISSION, Submission, read_submission
 from ctgraph_rl.board.tracks import Track, Variant
-from ctgraph_rl.checks import ReadOnlyValues, is_int, repeated, require
-from ctgraph_rl.disk import read_regular
+from ctgraph_rl.board.verification import STATES, Verification, verification_of
+from ctgraph_rl.checks import ReadOnlyValues, repeated, require
 from ctgraph_rl.report.bounds_of_runs import bounds_of_curriculum
 from ctgraph_rl.report.columns import board_columns
 from ctgraph_rl.report.intervals import Bounds, within_bounds
 from ctgraph_rl.runs.read import Problem
-from ctgraph_rl.strict import files_below, json_value, one_line_of, too_deep
-
-LEVELS = ("failed", "submitted", "rescored", "rerun", "held_out")
-"""How far a submission was verified, in rising order; ``failed``: a verification found a difference."""
-
-OF_FILES = {"none": "failed", **{level: level for level in LEVELS[2:]}}
+from ctgraph_rl.strict import files_below, one_line_of, too_deep
 
 DIGITS = 12
-
-
-class Verification(NamedTuple):
-    """How far a submission was verified."""
-
-    level: str  # one of `LEVELS`
-    bits: bool = True  # whether reruns are held to the same bits; False: only scores were tested
-    why_none: str = ""  # why a ``verification.json`` that is there counts for nothing
 
 
 @dataclass(frozen=True)
@@ -65,13 +50,13 @@ class BoardEntry:
 
     @property
     def level(self) -> str:
-        """How far it was verified, one of `LEVELS`."""
+        """How far it was verified, one of `STATES`."""
         return self.verification.level
 
     @property
     def verified(self) -> str:
         """The level in words, also whether scores were tested in place of bits."""
-        reran = self.level in LEVELS[3:]
+        reran = self.level in STATES[3:]
         return shown_level(self.level) + (", scores" if reran and not self.verification.bits else "")
 
     @property
@@ -174,42 +159,6 @@ def make_entry(submission: Submission) -> BoardEntry:
         agent_bytes=max((run.agent_bytes for run in submission.runs if run.agent_bytes is not None), default=None),
         folder=submission.path,
     )
-
-
-def verification_of(submission: Submission) -> Verification:
-    """Return how far a submission was verified; a verification of other files counts for nothing."""
-    path = submission.path / VERIFICATION
-    if not path.is_file():
-        return Verification("submitted")
-    try:
-        found = json_value(read_regular(path, verify.MOST_BYTES))
-        _check_verification(found)
-    except (OSError, ValueError) as error:
-        why = f"{VERIFICATION} counts for nothing, {error}; verify the submission again"
-        return Verification("submitted", why_none=why)
-    if found.get("digest") != submission.digest:
-        return Verification("submitted", why_none=f"{VERIFICATION} is of other files; verify the submission again")
-    return Verification(OF_FILES[found["level"]], found["bits"])
-
-
-def _check_verification(given: Any) -> None:
-    require((isinstance(given, dict), f"it must be an object, got {given!r:.80}"))
-    known = {name: given.get(name) for name in KINDS}
-    require(*((holds, f"its {message}") for holds, message in kind_rules(known, KINDS)))
-    reached = verify.level_of([Check(**check) for check in given["checks"]])
-    require((reached == given["level"], f"its checks give the level {reached}, not {given['level']}"))
-
-
-def _is_check(value: Any) -> bool:
-    return isinstance(value, dict) and {*value} == {*Check._fields} and type(value["passed"]) in (bool, type(None))
-
-
-KINDS = {
-    "schema": Kind(lambda value: is_int(value, verify.SCHEMA, verify.SCHEMA), str(verify.SCHEMA)),
-    "level": Kind(lambda value: isinstance(value, str) and value in OF_FILES, ", ".join(OF_FILES)),
-    "bits": Kind(lambda value: isinstance(value, bool), "true or false"),
-    "checks": list_of(Kind(_is_check, ""), "a list of checks with what, level and passed"),
-}
 
 
 def shown_level(level: str) -> str:
