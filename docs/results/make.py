@@ -1,7 +1,7 @@
 """Makes the pages of results and their figures from the raw results beside this file.
 
-``python docs/results/make.py`` makes all pages but ``statistics``, whose simulations take long; with a NAME it makes
-one. Raw results of a study that is finished are collected by the commit that `how_made.md` names.
+``python docs/results/make.py`` makes all pages, with a NAME one. Raw results of a study that is finished are collected
+by the commit that `how_made.md` names.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 PAGES = {
@@ -27,16 +26,13 @@ PAGES = {
 }
 """Pages, and the modules that make them."""
 
-APART = {"statistics": "studies.coverage"}
-"""What is made only by its name: the page of intervals."""
-
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Do what the command line says; errors are one message."""
     parser = argparse.ArgumentParser(prog="python docs/results/make.py", description=__doc__)
     parser.set_defaults(run=lambda options: _make(*PAGES.values()))
     commands = parser.add_subparsers(metavar="NAME")
-    for name, module in {**PAGES, **APART}.items():
+    for name, module in PAGES.items():
         commands.add_parser(name).set_defaults(run=lambda options, module=module: _make(module))
     _add_measurements(commands)
     options = parser.parse_args(arguments)
@@ -48,10 +44,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _add_measurements(commands: Any) -> None:
     """Add the commands that write raw results."""
-    collecting = commands.add_parser("every_curriculum", help="write the short runs of curricula, from all their runs")
-    collecting.add_argument("runs", type=Path, nargs="+", help="folders with runs of experiment=every_curriculum")
-    collecting.set_defaults(run=lambda options: import_module("studies.every_curriculum").collect(options.runs))
-
     measuring = commands.add_parser("gpu", help="measure a GPU for four minutes, into gpu.json and its page")
     measuring.add_argument("--minutes", type=float, default=4.0, help="limit of a call; the next call continues")
     measuring.add_argument("--commit", default="", help="what is measured, where the checkout has no .git")

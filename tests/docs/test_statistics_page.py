@@ -1,6 +1,9 @@
-"""docs/explanation/statistics.md: its tables are those of the script, which covers as the page says."""
+"""docs/explanation/statistics.md: intervals cover as its tables say."""
 
 from __future__ import annotations
+
+import math
+from zlib import crc32
 
 import numpy as np
 import pytest
@@ -14,11 +17,8 @@ pytest.importorskip("scipy")
 PAGE = CHECKOUT / "docs" / "explanation" / "statistics.md"
 
 
-@pytest.fixture(scope="module")
-def coverage():
-    from studies import coverage
-
-    return coverage
+SEEDS = (3, 5, 10, 20)
+RATE = 0.9
 
 
 def cells(*names: str) -> list[str]:
@@ -31,96 +31,89 @@ def covered(cell: str) -> float:
     return float(cell.split(" %")[0])
 
 
-def test_the_page_is_its_template_with_tables(coverage):
-    template = (CHECKOUT / "docs" / "results" / "templates" / "statistics.md").read_text(encoding="utf-8")
-    written = template.replace("$draws", f"{coverage.DRAWS:,}").replace("$noisy_draws", f"{coverage.NOISY_DRAWS:,}")
-
-    blocks = PAGE.read_text(encoding="utf-8").split("\n\n")
-    tables = {"| returns | interval": "$of_means", "| seeds | noise": "$of_noise", "| number |  |": "$of_others"}
-    named = [next((name for head, name in tables.items() if block.startswith(head)), block) for block in blocks]
-    assert "\n\n".join(named) == written
+def gaffke(values: list[float]) -> tuple[float, float]:
+    """The rule of the package for values in [0, 1]."""
+    found = statistics.mean(values, bounds=(0.0, 1.0))
+    return found.low, found.high
 
 
-@pytest.mark.parametrize("rule", ["**Gaffke**", "Student t"])
-def test_two_outcomes_are_covered_as_exact_sums_say(coverage, rule):
-    assert cells("two-valued", rule) == [coverage.cell(rule, "two-valued", n) for n in coverage.SEEDS]
+def student(values: list[float]) -> tuple[float, float]:
+    """Student's interval; of no width where all seeds agree."""
+    found = statistics.mean(values)
+    return (found.value, found.value) if found.low is None else (found.low, found.high)
+
+
+def draws_of(*names: object) -> np.random.Generator:
+    """The draws of a cell."""
+    return np.random.default_rng(crc32(" ".join(map(str, names)).encode()))
+
+
+def shown(covers: float, other: str) -> str:
+    return f"{covers:.1%}, {other}".replace("%", " %")
+
+
+@pytest.mark.parametrize(("name", "rule"), [("**Gaffke**", gaffke), ("Student t", student)])
+def test_two_outcomes_are_covered_as_exact_sums_say(name, rule):
+    expected = []
+    for n in SEEDS:
+        covers = width = 0.0
+        for ones in range(n + 1):
+            chance = math.comb(n, ones) * RATE**ones * (1 - RATE) ** (n - ones)
+            low, high = rule([1.0] * ones + [0.0] * (n - ones))
+            covers += chance * (low <= RATE <= high)
+            width += chance * (high - low)
+        expected.append(shown(covers, f"{width:.2f}"))
+
+    assert cells("two-valued", name) == expected
 
 
 @pytest.mark.parametrize(
-    ("rule", "shape", "n"),
+    ("name", "rule", "shape", "n"),
     [
-        *(pytest.param("**Gaffke**", *of, marks=pytest.mark.slow) for of in (("bounded", 3), ("skewed", 5))),
-        pytest.param("BCa bootstrap", "skewed", 10, marks=pytest.mark.slow),
-        ("Student t", "skewed", 5),
+        pytest.param("**Gaffke**", gaffke, "bounded", 3, marks=pytest.mark.slow),
+        pytest.param("**Gaffke**", gaffke, "skewed", 5, marks=pytest.mark.slow),
+        ("Student t", student, "skewed", 5),
     ],
 )
-def test_simulated_cells_are_computed_again(coverage, rule, shape, n):
-    assert cells(shape, rule)[coverage.SEEDS.index(n)] == coverage.cell(rule, shape, n)
+def test_simulated_cells_are_computed_again(name, rule, shape, n):
+    uniform = draws_of(shape, n).random((2000, n))
+    samples, centre = (uniform, 0.5) if shape == "bounded" else (1 - uniform**8, 1 - 1 / 9)
+    ends = np.array([rule(sample) for sample in samples.tolist()])
 
-
-@pytest.mark.parametrize(
-    ("kind", "noise", "n"),
-    [
-        ("equal, mean 1", 0.01, 3),
-        *(pytest.param("equal, mean 1", noise, 5, marks=pytest.mark.slow) for noise in (0.1, 0.5)),
-        *(pytest.param("solve at 0.5", 0.01, n, marks=pytest.mark.slow) for n in (20, 50)),
-        pytest.param("solve at 0.98", 0.5, 50, marks=pytest.mark.slow),
-    ],
-)
-def test_cells_of_noise_are_computed_again(coverage, kind, noise, n):
-    assert cells(kind, f"{noise:g}")[coverage.MORE_SEEDS.index(n)] == coverage.noisy_cell(kind, noise, n)
-
-
-def test_intervals_cover_noisy_returns_from_five_seeds_on(coverage):
-    shares = [
-        covered(cell) for kind in coverage.KINDS for noise in coverage.NOISES for cell in cells(kind, f"{noise:g}")
-    ]
-
-    assert len(shares) == 4 * 3 * 5 and (min(coverage.NOISES), max(coverage.NOISES)) == (0.01, 0.5)
-    assert min(shares) >= 94
-
-
-def test_bounds_of_a_mean_do_not_cover_noisy_returns_where_it_is_at_one(coverage):
-    samples, centre = coverage.noisy_returns("equal, mean 1", 0.01, n=20, draws=50)
-
-    assert not coverage.are_covered(np.clip(samples, 0, 1), centre, Bounds(0.0, 1.0)).any()
-    assert coverage.are_covered(samples, centre, Bounds(0.0, 1.0).widened(0.01)).all()
-
-
-@pytest.mark.parametrize("noise", [0.01, 0.5])
-@pytest.mark.parametrize("kind", ["equal, mean 1", "solve at 0.5", "solve at 0.9"])
-def test_what_is_counted_is_whether_the_intervals_of_the_package_hold_the_mean(coverage, kind, noise):
-    samples, _ = coverage.noisy_returns(kind, noise, n=5, draws=12)
-    samples[0, 0] = 20.0  # outside of all bounds, so that Student's interval counts
-    bounds = Bounds(0.0, 1.0).widened(noise)
-    found = [statistics.mean(sample, bounds=bounds) for sample in samples.tolist()]
-
-    for place, end in ((0, 1e-6), (1, -1e-6)):
-        for centre in [(each.low, each.high)[place] + shift for each in found[:4] for shift in (end, -end)]:
-            expected = [each.low <= centre <= each.high for each in found]
-            assert coverage.are_covered(samples, centre, bounds).tolist() == expected
-
-
-def test_times_are_computed_again(coverage):
-    name = "median of times, of which a third is never reached"
-    assert cells(name, "covers, has an end")[:2] == [coverage.of_times(n) for n in (3, 5)]
+    covers = (ends[:, 0] <= centre + 1e-12) & (centre - 1e-12 <= ends[:, 1])
+    width = (ends[:, 1] - ends[:, 0]).mean()
+    assert cells(shape, name)[SEEDS.index(n)] == shown(covers.mean(), f"{width:.2f}")
 
 
 @pytest.mark.slow
-def test_other_numbers_are_computed_again(coverage):
-    assert cells("interquartile mean of three tasks", "covers, width")[2] == coverage.of_middle_means(10)
-    for how, name in (
-        ("weighted", "**forward transfer, both sides weighted**"),
-        ("drawn again", "forward transfer, both sides drawn again"),
-    ):
-        assert cells(name, "covers, no end below")[1] == coverage.of_transfer(how, 5)
+def test_widened_bounds_cover_noisy_returns_and_bounds_of_a_mean_do_not():
+    noise = 0.01
+    samples = 1 + noise * draws_of("equal, mean 1", noise, 20).standard_normal((50, 20))
+
+    for values, bounds, share in ((samples, Bounds(0, 1).widened(noise), 1.0), (samples.clip(0, 1), Bounds(0, 1), 0.0)):
+        found = [statistics.mean(sample, bounds=bounds) for sample in values.tolist()]
+        assert np.mean([each.low <= 1 <= each.high for each in found]) == share
+    assert cells("equal, mean 1", "0.01")[3].startswith("100.0 %")
 
 
-def test_each_table_has_the_lines_and_columns_of_its_rules(coverage, monkeypatch):
-    monkeypatch.setattr(coverage, "cell", lambda rule, shape, n: cells(shape, rule)[coverage.SEEDS.index(n)])
-    of_means = [block for block in PAGE.read_text(encoding="utf-8").split("\n\n") if block.startswith("| returns")]
+def test_intervals_cover_noisy_returns_from_five_seeds_on():
+    kinds = ("equal, mean 1", "solve at 0.98", "solve at 0.9", "solve at 0.5")
+    shares = [covered(cell) for kind in kinds for noise in ("0.01", "0.1", "0.5") for cell in cells(kind, noise)]
 
-    assert coverage.of_means() == of_means[0]
+    assert len(shares) == 4 * 3 * 5
+    assert min(shares) >= 94
+
+
+def test_times_are_computed_again():
+    expected = []
+    for n in (3, 5):
+        rng = draws_of("times", n)
+        times = np.where(rng.random((2000, n)) < 1 / 3, np.inf, rng.exponential(size=(2000, n)))
+        found = [statistics.median_time(sample) for sample in times.tolist()]
+        covers = np.mean([each.low <= math.log(4) <= each.high for each in found])
+        expected.append(shown(covers, f"{np.mean([each.high < math.inf for each in found]):.0%}"))
+
+    assert cells("median of times, of which a third is never reached", "covers, has an end")[:2] == expected
 
 
 def test_the_rules_of_the_package_cover_and_students_does_not():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -54,4 +55,7 @@ def write_changed(tables: Sequence[Table], change: Callable[[Lines, Table], None
     for table in tables:
         change(lines[table.name], table)
     for name, of in lines.items():
-        raw.write(name, of, folder)
+        with open(folder / f"{name}.csv", "w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, list(of[0]))
+            writer.writeheader()
+            writer.writerows(of)

@@ -1,14 +1,13 @@
-"""Raw results as CSV files, and what tables are made of."""
+"""Raw results in CSV files, and what tables are made of."""
 
 from __future__ import annotations
 
 import csv
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.intervals import Bounds
@@ -41,28 +40,6 @@ def _lines(path: Path, changed: int) -> Raw:
     """Return the lines of a file, which are read again where it has changed."""
     with open(path, newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
-
-
-def write(name: str, lines: Sequence[Mapping[str, Any]], folder: Path | None = None) -> None:
-    """Write the raw results of a table, to where they are stored or to another folder.
-
-    Raises:
-        ValueError: where there are none, before the file is touched.
-    """
-    if not lines:
-        raise ValueError(f"no raw results of {name}, whose file stays as it was: give the folder of its runs")
-    columns = dict.fromkeys(column for line in lines for column in line)
-    path = (folder or HERE) / f"{name}.csv"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(columns), restval=NOT_RECORDED)
-        writer.writeheader()
-        writer.writerows(lines)
-
-
-def machine_of(about: Mapping[str, Any]) -> dict[str, str]:
-    """The machine of a run, as the first line of its log says it."""
-    return {key: str(about.get(key) or NOT_RECORDED) for key in MACHINE}
 
 
 def machines(*names: str) -> str:
