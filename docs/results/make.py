@@ -9,7 +9,10 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Any
+
+HERE = Path(__file__).resolve().parent
 
 PAGES = {
     "adaptation": "studies.adaptation",
@@ -30,10 +33,10 @@ PAGES = {
 def main(arguments: Sequence[str] | None = None) -> None:
     """Do what the command line says; errors are one message."""
     parser = argparse.ArgumentParser(prog="python docs/results/make.py", description=__doc__)
-    parser.set_defaults(run=lambda options: _make(*PAGES.values()))
+    parser.set_defaults(run=lambda options: _make(*PAGES))
     commands = parser.add_subparsers(metavar="NAME")
-    for name, module in PAGES.items():
-        commands.add_parser(name).set_defaults(run=lambda options, module=module: _make(module))
+    for name in PAGES:
+        commands.add_parser(name).set_defaults(run=lambda options, name=name: _make(name))
     _add_measurements(commands)
     options = parser.parse_args(arguments)
     try:
@@ -54,10 +57,13 @@ def _add_measurements(commands: Any) -> None:
     measuring.set_defaults(run=lambda options: import_module("studies.gpu").measure(options))
 
 
-def _make(*modules: str) -> None:
-    """Make pages and their figures; a module is imported when it is needed, as most import PyTorch."""
-    for name in modules:
-        import_module(name).make()
+def _make(*names: str) -> None:
+    """Write pages and their figures; a module is imported when it is needed, as most import PyTorch."""
+    for name in names:
+        study = import_module(PAGES[name])
+        (HERE / f"{name}.md").write_text(study.page(), encoding="utf-8")
+        if hasattr(study, "draw"):
+            study.draw(HERE)
 
 
 if __name__ == "__main__":

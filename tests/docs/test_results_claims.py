@@ -7,6 +7,7 @@ from itertools import product
 from statistics import NormalDist
 
 import pytest
+from helpers.conclusions.baselines import changes
 from helpers.paths import CHECKOUT
 from omegaconf import OmegaConf
 
@@ -76,12 +77,10 @@ def test_a2c_on_fo_b2_learns_one_goal_in_some_seeds_and_meets_the_other(make):
 
 
 def test_instances_cost_nothing_greedily_and_serve_dqn_as_dice(make):
-    from studies.baselines import instances as alone
-
-    greedy, sampled = alone.changes("greedy"), alone.changes("sampled")
+    greedy, sampled = changes("greedy"), changes("sampled")
     two = {key for key in greedy if key[0] != "fo_b1" and key[1] in ("1.2", "2.1")}
 
-    cells = make.groups(make.read(alone.INSTANCES), "configuration", "task", "agent")
+    cells = make.groups(make.read("baselines_b1_instances"), "configuration", "task", "agent")
     assert {len(lines) for lines in cells.values()} == {5} and len(cells) == 4 * 4 * 4
     assert min(greedy.values()) == 0
     assert min(sampled, key=sampled.__getitem__) == ("posr_b1", "2.2", "a2c")
@@ -115,9 +114,7 @@ def test_the_experiment_of_instances_is_that_of_constant_images_with_noise_and_r
 
 
 def test_rl2_searches_as_the_best_policy_does_at_depth_2_in_four_of_five_seeds(make):
-    from studies.baselines import search
-
-    lines = [line for line in make.read(search.NAME) if line["depth"] == "2"]
+    lines = [line for line in make.read("rl2_search") if line["depth"] == "2"]
     seeds = {
         seed: [float(line["greedy_success"]) for line in each] for (seed,), each in make.groups(lines, "seed").items()
     }

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import torch
 from studies.lifelong import comparison, pairs
-from studies.lifelong.experiments import expected
 from studies.raw import groups, read
 
 from ctgraph_rl.metrics import MASTERED, Curves
@@ -78,7 +77,6 @@ class ByAgent:
 
     def __init__(self) -> None:
         self.of = groups(read("methods"), "curriculum", "method", "agent", "seed")
-        self.swept = expected("methods")
 
     def runs(self, axis: str, method: str, agent: str) -> list[Curves]:
         """Runs of one cell, in the order of their seeds."""

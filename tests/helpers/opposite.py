@@ -55,7 +55,9 @@ def write_changed(tables: Sequence[Table], change: Callable[[Lines, Table], None
     for table in tables:
         change(lines[table.name], table)
     for name, of in lines.items():
-        with open(folder / f"{name}.csv", "w", newline="", encoding="utf-8") as file:
+        path = folder / f"{name}.csv"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(path, "w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, list(of[0]))
             writer.writeheader()
             writer.writerows(of)

@@ -41,7 +41,7 @@ def _clearest(of: BoardTable) -> str:
     names = {line.name for line in of.standings if line.best_rank == 1}
     found = {pair: each for pair, each in of.pairs.items() if names.issuperset(pair)}
     one, other = min(found, key=lambda pair: found[pair].p_value or 0)
-    return f"{one} less {other}, {undecided(found[one, other], len(of.pairs))}"
+    return f"{one} less {other}, {undecided(found[one, other])}"
 
 
 def _without(there: set[str]) -> str:

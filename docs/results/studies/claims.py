@@ -4,42 +4,38 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import fmean, median
-from string import Template
 
 from ctgraph_rl.metrics.curves import frames_to_mastery
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS
 from ctgraph_rl.tasks.values import open_loop_ceiling
 from studies.lifelong import comparison
 from studies.memory.conditions import GIVEN, finished
-from studies.raw import HERE, TEMPLATES, Raw, groups, machines, numbers_in, read, shown, table
+from studies.raw import Raw, fill, groups, machines, numbers_in, read, select, shown, table
 from studies.verdicts import (
     AGREES,
     DISAGREES,
     MOST_SEEDS,
+    OF_PAIRS,
     UNKNOWN,
     VERDICTS,
     Effect,
+    compare_times,
     differences,
+    effect_of_signs,
     later,
     pairs,
-    share_reached,
-    shares_later,
     time,
 )
 
 NAME = "claim_runs"
-PAGE = HERE / "claims.md"
 
 OF_SUCCESS = 0.25
 """The smallest difference of a share of episodes or tasks that counts."""
 
 OF_FAILURE = 0.5
 """The loss of success that counts as more than an agent is capable of."""
-
-OF_PAIRS = 0.5
-"""The smallest effect on times that counts: three of four pairs are later and one is earlier."""
 
 RECURRENT = (
     "lstm_ppo",
@@ -166,20 +162,13 @@ class Row:
 
 def runs(curriculum: str, **conditions: str) -> Raw:
     """Return the lines of a curriculum under some conditions, by seed."""
-    lines = [line for line in read(NAME) if line["curriculum"] == curriculum]
-    found = [line for line in lines if all(line[key] == value for key, value in conditions.items())]
+    found = select(read(NAME), curriculum=curriculum, **conditions)
     return sorted(found, key=lambda line: int(line["seed"]))
 
 
-def of_times(first: Raw, second: Raw, columns: Sequence[str]) -> Effect:
-    """Return the effect "the first runs are later", a value for each seed."""
-    return Effect(shares_later(first, second, columns), OF_PAIRS, share_reached(first, second, columns))
-
-
-def pairs_in_words(first: Raw, second: Raw, columns: Sequence[str]) -> str:
-    """Return how many times are later and earlier in the first runs than in the second."""
-    signs = [later(one[column], other[column]) for one, other in pairs(first, second) for column in columns]
-    return f"later in {signs.count(1)} of {len(signs)} pairs, earlier in {signs.count(-1)}"
+def mean(lines: Raw, column: str) -> float:
+    """Return the mean of a column."""
+    return fmean(numbers_in(lines, column))
 
 
 def frames_in_words(lines: Raw, columns: Sequence[str]) -> str:
@@ -190,68 +179,52 @@ def frames_in_words(lines: Raw, columns: Sequence[str]) -> str:
 
 def large_sets() -> list[Row]:
     """A large set of images impairs memory."""
-    one, many = (runs("co_hard", num_wait_images=number, cell="lstm") for number in ("1", "5000"))
-    sizes = "; ".join(
-        f"{number}: {frames_in_words(runs('co_hard', num_wait_images=number, cell='lstm'), FIRST)}"
-        for number in ("1", "10", "500", "5000")
-    )
-    older = older_sets()
-    return [
-        Row(
-            "sets",
-            "5,000 wait images against one: frames to a return of 0.9, LSTM-PPO",
-            f"{pairs_in_words(many, one, FIRST)}; median by images {sizes}",
-            of_times(many, one, FIRST),
-        ),
-        Row("sets", "500 wait images against 100, six agents with memory, four graphs", *older),
-    ]
+    of = {number: runs("co_hard", num_wait_images=number, cell="lstm") for number in ("1", "10", "500", "5000")}
+    sizes = "; ".join(f"{number}: {frames_in_words(lines, FIRST)}" for number, lines in of.items())
+    words, effect = compare_times(of["5000"], of["1"], FIRST)
+    test = "5,000 wait images against one: frames to a return of 0.9, LSTM-PPO"
+    first = Row("sets", test, f"{words}; median by images {sizes}", effect)
+    return [first, Row("sets", "500 wait images against 100, six agents with memory, four graphs", *older_sets())]
 
 
 def older_sets() -> tuple[str, Effect]:
     """Return the comparison of 500 images with 100, a value for each agent and seed."""
     of = finished()
-    few = [condition for condition in GIVEN if condition.num_wait_images == "100" and condition.wait_prob != "0"]
     signs: dict[tuple[str, str], list[int]] = {}
     reached = []
-    for condition in few:
-        beside = of[condition._replace(num_wait_images="500")]
-        for agent in RECURRENT:
-            for one, other in pairs(of[condition][agent], beside[agent]):
-                times = (other["frames_to_90"], one["frames_to_90"])
-                signs.setdefault((agent, one["seed"]), []).append(later(*times))
-                reached.append(any(times))
-    each = [sign for found in signs.values() for sign in found]
-    words = f"later in {each.count(1)} of {len(each)} pairs, earlier in {each.count(-1)}"
-    return words, Effect([fmean(found) for found in signs.values()], OF_PAIRS, fmean(reached))
+    for condition in GIVEN:
+        if condition.num_wait_images == "100" and condition.wait_prob != "0":
+            beside = of[condition._replace(num_wait_images="500")]
+            for agent in RECURRENT:
+                for few, many in pairs(of[condition][agent], beside[agent]):
+                    times = (many["frames_to_90"], few["frames_to_90"])
+                    signs.setdefault((agent, few["seed"]), []).append(later(*times))
+                    reached.append(any(times))
+    return effect_of_signs(list(signs.values()), fmean(reached))
 
 
 def gradients() -> list[Row]:
-    """A reward gradient helps on large graphs."""
+    """A reward gradient helps on large graphs; without guided runs no run met an end, so no effect was possible."""
     found = []
     for depth, (branches, graph) in LARGE.items():
         gradient, needle = (runs("guided_gradient", depth=depth, reward_fn=name) for name in ("gradient", "needle"))
-        if not gradient:
-            found.append(without_guide(depth, graph))
-        else:
-            ends = [fmean(numbers_in(lines, "end_rate")) for lines in (gradient, needle)]
-            reached = Effect(differences(gradient, needle, "end_rate"), OF_SUCCESS, 1 - ends[1])
+        if gradient:
+            ends = [mean(lines, "end_rate") for lines in (gradient, needle)]
+            effect = Effect(differences(gradient, needle, "end_rate"), OF_SUCCESS, 1 - ends[1])
             number = f"episodes at an end {ends[0]:.2f} and {ends[1]:.2f}"
-            found.append(Row("gradient", f"gradient against one goal, PPO, {graph}", number, reached))
-            returns = numbers_in(gradient, "return")
+            found.append(Row("gradient", f"gradient against one goal, PPO, {graph}", number, effect))
             chance = return_of_random_ends(gradient[0]["order"], branches)
-            values = [value - chance for value in returns]
+            values = [value - chance for value in numbers_in(gradient, "return")]
             near = Effect(values, OF_SUCCESS, 1 - chance, (-chance, 1 - chance))
             test = f"return less that of random ends, {chance:.2f}, PPO with the gradient, {graph}"
-            found.append(Row("gradient", test, f"return {fmean(returns):.2f}", near))
+            found.append(Row("gradient", test, f"return {mean(gradient, 'return'):.2f}", near))
+        else:
+            gradient, needle = (runs("large_gradient", depth=depth, reward_fn=name) for name in ("gradient", "needle"))
+            met = max(numbers_in(gradient + needle, "end_rate"))
+            effect = Effect(differences(gradient, needle, "end_rate"), OF_SUCCESS, met)
+            test = f"the same without a guide, PPO, {graph}"
+            found.append(Row("gradient", test, f"episodes at an end {met:.2f}", effect))
     return found
-
-
-def without_guide(depth: str, graph: str) -> Row:
-    """The row of a graph without guided runs: no run met an end, so no effect was possible."""
-    gradient, needle = (runs("large_gradient", depth=depth, reward_fn=name) for name in ("gradient", "needle"))
-    met = max(numbers_in(gradient + needle, "end_rate"))
-    effect = Effect(differences(gradient, needle, "end_rate"), OF_SUCCESS, met)
-    return Row("gradient", f"the same without a guide, PPO, {graph}", f"episodes at an end {met:.2f}", effect)
 
 
 def return_of_random_ends(goal: str, branches: int) -> float:
@@ -268,26 +241,24 @@ def noise() -> list[Row]:
     for depth, frames in NOISY:
         plain = runs("stochastic_rewards", depth=depth, reward_std="0", frames=SHORT)
         noisy = runs("stochastic_rewards", depth=depth, reward_std="1", frames=frames)
-        success = [fmean(numbers_in(lines, "success")) for lines in (noisy, plain)]
-        effect = Effect(differences(plain, noisy, "success"), OF_FAILURE, success[1], absent=depth in SMALL)
+        success = mean(plain, "success")
+        effect = Effect(differences(plain, noisy, "success"), OF_FAILURE, success, absent=depth in SMALL)
         test = f"noise of standard deviation 1 against none, PPO, depth {depth}"
         if frames != SHORT:
             test += f", {int(frames):,} frames with noise"
-        rows.append(Row("noise", test, f"success {success[0]:.2f} and {success[1]:.2f}", effect))
+        rows.append(Row("noise", test, f"success {mean(noisy, 'success'):.2f} and {success:.2f}", effect))
     return rows
 
 
 def negative_samples() -> list[Row]:
     """Negative samples keep a policy from ends."""
-    ends = {std: numbers_in(runs("negative_rewards", reward_std=std, goal_reward="1"), "end_rate") for std in STDS}
-    control = fmean(numbers_in(runs("negative_rewards", goal_reward="-1"), "end_rate"))
-    plain = runs("negative_rewards", reward_std="0", goal_reward="1")
-    noisy = runs("negative_rewards", reward_std=STDS[-1], goal_reward="1")
-    rates = ", ".join(f"{std}: {fmean(values):.2f}" for std, values in ends.items())
+    of = {std: runs("negative_rewards", reward_std=std, goal_reward="1") for std in STDS}
+    control = mean(runs("negative_rewards", goal_reward="-1"), "end_rate")
+    rates = ", ".join(f"{std}: {mean(lines, 'end_rate'):.2f}" for std, lines in of.items())
     number = f"episodes at an end by standard deviation {rates}; control {control:.2f}"
-    effect = Effect(differences(plain, noisy, "end_rate"), OF_SUCCESS, fmean(ends["0"]) - control)
-    test = f"noise of standard deviation {STDS[-1]} against none, PPO, CT-FO-B1"
-    return [Row("negative", test, number, effect)]
+    lost = differences(of["0"], of[STDS[-1]], "end_rate")
+    effect = Effect(lost, OF_SUCCESS, mean(of["0"], "end_rate") - control)
+    return [Row("negative", f"noise of standard deviation {STDS[-1]} against none, PPO, CT-FO-B1", number, effect)]
 
 
 def advantages() -> list[Row]:
@@ -295,11 +266,12 @@ def advantages() -> list[Row]:
     rows = []
     for name, cell, other in OF_MEMORY:
         lines = tested(cell)
-        beside = [line for line in tested(other) if line["seed"] in {line["seed"] for line in lines}]
+        seeds = {line["seed"] for line in lines}
+        beside = [line for line in tested(other) if line["seed"] in seeds]
+        words, effect = compare_times(beside, lines, FIRST)
         medians = f"medians {frames_in_words(lines, FIRST)} and {frames_in_words(beside, FIRST)}"
-        number = f"the other is {pairs_in_words(beside, lines, FIRST)}; {medians}"
         test = f"{name} against {MEMORIES[other]}, frames to 0.9"
-        rows.append(Row("memory", test, number, of_times(beside, lines, FIRST)))
+        rows.append(Row("memory", test, f"the other is {words}; {medians}", effect))
     return rows
 
 
@@ -313,57 +285,50 @@ def stochastic_observations() -> list[Row]:
     """Fully stochastic observations are hard unless those of one kind share features."""
     rows = []
     for size in ("10", "50", "200"):
-        alike, apart = (
-            runs("stochastic_grouped", group_size=size, within=within, frames="204800") for within in ("0.1", "0.3")
-        )
-        learned = [fmean(numbers_in(lines, "tasks_learned")) for lines in (alike, apart)]
-        gained = [value / 4 for value in differences(alike, apart, "tasks_learned")]
-        effect = Effect(gained, OF_SUCCESS, 1 - learned[1] / 4)
-        number = f"{learned[0]:.1f} and {learned[1]:.1f} of 4 tasks learned"
-        rows.append(Row("stochastic", f"sets of {size}, alike against unrelated, LSTM-PPO", number, effect))
+        of = [runs("stochastic_grouped", group_size=size, within=within, frames=SHORT) for within in ("0.1", "0.3")]
+        alike, apart = (mean(lines, "tasks_learned") for lines in of)
+        gained = [value / 4 for value in differences(*of, "tasks_learned")]
+        number = f"{alike:.1f} and {apart:.1f} of 4 tasks learned"
+        test = f"sets of {size}, alike against unrelated, LSTM-PPO"
+        rows.append(Row("stochastic", test, number, Effect(gained, OF_SUCCESS, 1 - apart / 4)))
     return rows
 
 
 def open_loop() -> list[Row]:
     """With p = 0 an agent can ignore all inputs."""
-    ceilings = {name: (make().graph.wait_prob > 0, open_loop_ceiling(make())) for name, make in CONFIGURATIONS.items()}
-    agrees = all((best < 1) is waits for waits, best in ceilings.values())
-    number = ", ".join(f"{name} {best:g}" for name, (_, best) in sorted(ceilings.items(), key=lambda each: each[1][0]))
-    test = "return of the best fixed sequence of actions"
-    return [Row("fixed", test, number, None, AGREES if agrees else DISAGREES)]
+    agrees = True
+    parts = []
+    for waits in (False, True):
+        for name, make in CONFIGURATIONS.items():
+            task = make()
+            if (task.graph.wait_prob > 0) is waits:
+                best = open_loop_ceiling(task)
+                agrees &= (best < 1) is waits
+                parts.append(f"{name} {best:g}")
+    verdict = AGREES if agrees else DISAGREES
+    return [Row("fixed", "return of the best fixed sequence of actions", ", ".join(parts), None, verdict)]
 
 
 def similarity() -> list[Row]:
     """Tasks without similarities test forgetting, and not transfer."""
     tuned, scratch = (runs("fo_b1_dissimilar", method=method, frames="409600") for method in ("finetune", "scratch"))
-    nested_scratch = nested_goals("scratch")
-    nested_tuned = nested_goals("finetune")
-    control = of_times(nested_scratch, nested_tuned, LATER)
-    forgotten = numbers_in(tuned, "forgetting")
+    nested, control = compare_times(nested_goals("scratch"), nested_goals("finetune"), LATER)
+    words, transfer = compare_times(scratch, tuned, LATER)
     room = 1.0 if control.verdict == AGREES else 0.0
-    transfer = Effect(shares_later(scratch, tuned, LATER), OF_PAIRS, room, absent=True)
-    number = f"scratch is {pairs_in_words(scratch, tuned, LATER)}; on nested goals, the control, "
+    forgotten = Effect(numbers_in(tuned, "forgetting"), OF_SUCCESS, 1.0)
+    number = f"scratch is {words}; on nested goals, the control, {nested}"
+    test = "transfer to later tasks: `scratch` against fine-tuning, PPO"
     return [
-        Row(
-            "dissimilar",
-            "forgetting of fine-tuned PPO",
-            f"{fmean(forgotten):.2f}",
-            Effect(forgotten, OF_SUCCESS, 1.0),
-        ),
-        Row(
-            "dissimilar",
-            "transfer to later tasks: `scratch` against fine-tuning, PPO",
-            number + pairs_in_words(nested_scratch, nested_tuned, LATER),
-            transfer,
-        ),
+        Row("dissimilar", "forgetting of fine-tuned PPO", f"{mean(tuned, 'forgetting'):.2f}", forgotten),
+        Row("dissimilar", test, number, replace(transfer, room=room, absent=True)),
     ]
 
 
 def nested_goals(method: str) -> Raw:
     """Return the times of PPO on growing depth, a line for each seed, from the table of methods."""
-    lines = [line for line in read("methods") if (line["agent"], line["curriculum"]) == ("ppo", "fo_b1_depth2to5")]
+    lines = select(read("methods"), agent="ppo", curriculum="fo_b1_depth2to5", method=method)
     found = []
-    for (seed,), of in groups([line for line in lines if line["method"] == method], "seed").items():
+    for (seed,), of in groups(lines, "seed").items():
         terms: Sequence[float | None] = frames_to_mastery(comparison.curves(of)).terms or ()
         times = ["" if term is None else f"{term:g}" for term in terms]
         found.append({"seed": seed, **dict(zip(ALL, times, strict=True))})
@@ -375,11 +340,8 @@ def waiting() -> list[Row]:
     scratch = runs("shared_waiting", method="scratch")
     rows = []
     for method in ("finetune", "clear", "mask_lc"):
-        lines = runs("shared_waiting", method=method)
-        number = f"{pairs_in_words(scratch, lines, LATER)} from scratch"
-        rows.append(
-            Row("waiting", f"`scratch` against `{method}`, later tasks", number, of_times(scratch, lines, LATER))
-        )
+        words, effect = compare_times(scratch, runs("shared_waiting", method=method), LATER)
+        rows.append(Row("waiting", f"`scratch` against `{method}`, later tasks", f"{words} from scratch", effect))
     return rows
 
 
@@ -411,33 +373,29 @@ def summary(found: Sequence[Row]) -> str:
 
 def settings() -> str:
     """Return the learning rate of each memory."""
-    rates = {
-        cell: {line["learning_rate"] for line in tested(cell)} for cell in ("lstm", "attention", PLASTIC, MODULATED)
-    }
-    return ", ".join(f"{cell} {', '.join(sorted(found))}" for cell, found in rates.items())
+    parts = []
+    for cell in MEMORIES:
+        rates = sorted({line["learning_rate"] for line in tested(cell)})
+        parts.append(f"{cell} {', '.join(rates)}")
+    return ", ".join(parts)
 
 
 def page() -> str:
-    """The page: its template with its table and numbers."""
-    text = (TEMPLATES / "claims.md").read_text(encoding="utf-8")
+    """The page."""
     found = rows()
     verdicts = [row.verdict for row in found]
     head = ["sentence", "test", "found", "effect", "smallest effect seen", "verdict"]
-    return Template(text).substitute(
-        summary=summary(found),
-        table=table(head, [row.cells() for row in found]),
-        num_tests=len(found),
-        num_agrees=verdicts.count(AGREES),
-        num_disagrees=verdicts.count(DISAGREES),
-        num_unknown=verdicts.count(UNKNOWN),
-        of_success=OF_SUCCESS,
-        of_failure=OF_FAILURE,
-        of_pairs=OF_PAIRS,
-        settings=settings(),
-        machines=machines("memory_cells", NAME),
-    )
-
-
-def make() -> None:
-    """Write the page."""
-    PAGE.write_text(page(), encoding="utf-8")
+    texts = {
+        "summary": summary(found),
+        "table": table(head, [row.cells() for row in found]),
+        "num_tests": len(found),
+        "num_agrees": verdicts.count(AGREES),
+        "num_disagrees": verdicts.count(DISAGREES),
+        "num_unknown": verdicts.count(UNKNOWN),
+        "of_success": OF_SUCCESS,
+        "of_failure": OF_FAILURE,
+        "of_pairs": OF_PAIRS,
+        "settings": settings(),
+        "machines": machines("memory_cells", NAME),
+    }
+    return fill("claims", texts)

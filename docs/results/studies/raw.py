@@ -5,9 +5,10 @@ from __future__ import annotations
 import csv
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
+from string import Template
 
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.intervals import Bounds
@@ -47,6 +48,16 @@ def machines(*names: str) -> str:
     rows = [line for name in names for line in read(name)]
     counts = Counter(", ".join(dict.fromkeys(line.get(key) or NOT_RECORDED for key in MACHINE)) for line in rows)
     return "; ".join(f"{count:,} of {len(rows):,} rows: {what}" for what, count in sorted(counts.items()))
+
+
+def fill(name: str, texts: Mapping[str, object]) -> str:
+    """Return a page: its template with the texts that it names."""
+    return Template((TEMPLATES / f"{name}.md").read_text(encoding="utf-8")).substitute(texts)
+
+
+def select(lines: Raw, **values: str) -> Raw:
+    """Return the lines with some values."""
+    return [line for line in lines if all(line[key] == value for key, value in values.items())]
 
 
 def groups(raw: Raw, *keys: str) -> dict[tuple[str, ...], Raw]:

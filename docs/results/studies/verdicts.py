@@ -22,6 +22,9 @@ SHARES = (-1.0, 1.0)
 ALPHA = 0.05
 """Of all tests."""
 
+OF_PAIRS = 0.5
+"""The smallest effect on times that counts: three of four pairs are later and one is earlier."""
+
 MOST_SEEDS = 200
 STEPS = 40
 """Halvings that find the smallest effect."""
@@ -106,40 +109,20 @@ def _sees_equal(effect: float, n: int, bounds: tuple[float, float]) -> bool:
     return low is not None and low > 0
 
 
-def undecided(found: Comparison, number: int = 1) -> str:
+def undecided(found: Comparison) -> str:
     """Return a difference that a test did not find, with its interval and the pairs that would do.
 
     Args:
-        found: the comparison.
-        number: of all comparisons that p-values are corrected for.
+        found: the comparison; one that is not corrected for others is the only one.
 
     Raises:
         ValueError: for a difference that was found, p <= 0.05 after the correction.
     """
-    p_value = found.p_value if found.holm is None else found.holm
-    if p_value is None or p_value <= ALPHA:
-        raise ValueError(f"a difference of p = {p_value} is not undecided: the page says otherwise")
-    needed = seeds_that_would_do(found, number)
-    return shown(found.difference) + (f" ({needed:,} pairs would do)" if needed else "")
-
-
-def seeds_that_would_do(found: Comparison, number: int = 1) -> int | None:
-    """Return the pairs that a t-test needs to find a difference like this, and at least those of a test by signs.
-
-    None where there is no difference.
-
-    Args:
-        found: the comparison.
-        number: of all comparisons that p-values are corrected for; Bonferroni's level, which Holm's is not below.
-    """
-    alpha = ALPHA / number
-    least = math.ceil(math.log2(2 / alpha))
-    if not found.difference.value:
-        return None
-    if not found.std:
-        return least
-    needed = statistics.seeds_needed(abs(found.difference.value), found.std, paired=True, level=1 - alpha)
-    return max(least, needed)
+    if found.holm is None:
+        found = statistics.corrected({"": found})[""]
+    if found.holm is None or found.holm <= ALPHA:
+        raise ValueError(f"a difference of p = {found.holm} is not undecided: the page says otherwise")
+    return shown(found.difference) + (f" ({found.needed:,} pairs would do)" if found.needed else "")
 
 
 def pairs(first: Raw, second: Raw) -> list[tuple[dict[str, str], dict[str, str]]]:
@@ -169,12 +152,23 @@ def later(first: str, second: str) -> int:
     return (time(first) > time(second)) - (time(first) < time(second))
 
 
-def shares_later(first: Raw, second: Raw, columns: Sequence[str]) -> list[float]:
-    """Return for each seed the share of its times that are later in the first runs, less the share of earlier ones."""
-    signs = [[later(one[column], other[column]) for column in columns] for one, other in pairs(first, second)]
-    return [fmean(of_seed) for of_seed in signs]
+def compare_times(first: Raw, second: Raw, columns: Sequence[str]) -> tuple[str, Effect]:
+    """Return the effect "the first runs are later" in words, and as a value for each seed."""
+    signs = []
+    reached = []
+    for one, other in pairs(first, second):
+        signs.append([later(one[column], other[column]) for column in columns])
+        reached += [bool(one[column] or other[column]) for column in columns]
+    return effect_of_signs(signs, fmean(reached))
 
 
-def share_reached(first: Raw, second: Raw, columns: Sequence[str]) -> float:
-    """Return the share of pairs of times of which at least one was reached: the others are ties, whatever is true."""
-    return fmean(bool(one[column] or other[column]) for one, other in pairs(first, second) for column in columns)
+def effect_of_signs(signs: Sequence[Sequence[int]], reached: float) -> tuple[str, Effect]:
+    """Return the share of later times less that of earlier ones, in words and as an effect.
+
+    Args:
+        signs: of each seed, what `later` returns.
+        reached: the share of pairs of which at least one time was reached: the others are ties, whatever is true.
+    """
+    all_signs = [sign for of_seed in signs for sign in of_seed]
+    words = f"later in {all_signs.count(1)} of {len(all_signs)} pairs, earlier in {all_signs.count(-1)}"
+    return words, Effect([fmean(of_seed) for of_seed in signs], OF_PAIRS, reached)

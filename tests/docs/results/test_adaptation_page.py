@@ -6,13 +6,14 @@ from itertools import product
 from statistics import fmean
 
 import pytest
+from helpers.paths import CHECKOUT
 from studies import adaptation, adaptation_swap
 
 import curricula
 
 
 def test_the_page_is_made_from_the_raw_results():
-    assert adaptation.page() == adaptation.PAGE.read_text(encoding="utf-8")
+    assert adaptation.page() == (CHECKOUT / "docs" / "results" / "adaptation.md").read_text(encoding="utf-8")
 
 
 def test_the_best_policy_without_memory_has_the_mean_of_the_ceilings_of_the_goals():

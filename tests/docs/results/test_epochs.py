@@ -19,11 +19,11 @@ TABLES = ("masks_ct8_md", "masks_ct8", "masks_ct12")
 @pytest.fixture(scope="module")
 def measured():
     """The scores of the runs of a method, by the table, the number of epochs and the method."""
-    from studies.lifelong import comparison, experiments, pairs
+    from studies.lifelong import comparison, pairs
 
     found = {}
     for table in comparison.MASKS:
-        for num, name in ((8, experiments.eight(table)), (1, table)):
+        for num, name in ((8, f"epochs/{table}"), (1, table)):
             for (method, _), lines in comparison.groups(comparison.read(name), "method", "seed").items():
                 if method in METHODS:
                     scores = comparison.scores(lines) | {"while learning": pairs.while_learning(lines)}

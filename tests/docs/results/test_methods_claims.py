@@ -7,6 +7,7 @@ import math
 import pytest
 from helpers.claims import Claims, readings, sentences
 from helpers.paths import CHECKOUT
+from studies.lifelong import comparison
 
 from ctgraph_rl.report import statistics
 
@@ -28,21 +29,21 @@ def _(t):
     """Separate networks for each task (`scratch`, `mask_ri`) end with all four tasks, and PPO with each method other
     than CLEAR in at least 18 of 20 seeds."""
     apart = [t.known(axis, method, agent) for axis, agent in both_axes(t) for method in ("scratch", "mask_ri")]
-    others = [method for method in t.swept["method"] if method not in ("finetune", "clear")]
+    others = [method for method in comparison.METHODS if method not in ("finetune", "clear")]
     of_ppo = [int(t.known(axis, method, "ppo").all(1).sum()) for axis in ("4tasks", "4images") for method in others]
     return all(known.all() for known in apart) and min(of_ppo) == 18
 
 
 def both_axes(t):
     """The sequences of goals and of images with each agent."""
-    return [(axis, agent) for axis in ("4tasks", "4images") for agent in t.swept["agent"]]
+    return [(axis, agent) for axis in ("4tasks", "4images") for agent in comparison.AGENTS]
 
 
 @reads("methods")
 def _(t):
     """CLEAR, without ids and boundaries, keeps most images and, except with A2C, about three goals of four."""
-    return min(t.known("4images", "clear", agent).double().mean() for agent in t.swept["agent"]) >= 0.7 and {
-        agent: 0.7 <= t.known("4tasks", "clear", agent).double().mean() <= 0.8 for agent in t.swept["agent"]
+    return min(t.known("4images", "clear", agent).double().mean() for agent in comparison.AGENTS) >= 0.7 and {
+        agent: 0.7 <= t.known("4tasks", "clear", agent).double().mean() <= 0.8 for agent in comparison.AGENTS
     } == {"ppo": True, "a2c": False, "dqn": True, "lstm_ppo": True}
 
 
@@ -50,7 +51,7 @@ def _(t):
 def _(t):
     """With growing depth, methods that share nothing between tasks stop before depth 5: 69 of the 70 runs with
     `scratch` and `mask_ri`."""
-    own = [t.own("depth2to5", method, agent) for method in ("scratch", "mask_ri") for agent in t.swept["agent"]]
+    own = [t.own("depth2to5", method, agent) for method in ("scratch", "mask_ri") for agent in comparison.AGENTS]
     return (sum(map(len, own)), sum(int((~each[:, -1]).sum()) for each in own)) == (70, 69)
 
 
@@ -58,7 +59,7 @@ def _(t):
 def _(t):
     """CLEAR solves all four depths with every agent in every seed, fine-tuned PPO in 14 of 20."""
     by_ppo = t.known("depth2to5", "finetune", "ppo").all(1)
-    every = all(t.known("depth2to5", "clear", agent).all() for agent in t.swept["agent"])
+    every = all(t.known("depth2to5", "clear", agent).all() for agent in comparison.AGENTS)
     return every and (int(by_ppo.sum()), len(by_ppo)) == (14, 20)
 
 
@@ -104,7 +105,7 @@ def _(t):
 def _(t):
     """With the other three agents each method is better than fine-tuning between goals. Between image sets all but EWC
     and CLEAR are better, with growing depth none (15 pairs, taken as independent; p <= 0.05, corrected for 33)."""
-    every = {method for method in t.swept["method"] if method != "finetune"}
+    every = {method for method in comparison.METHODS if method != "finetune"}
     found = better(t, "a2c", "dqn", "lstm_ppo", pairs=15)
     return found == {"4tasks": every, "4images": every - {"ewc", "clear"}, "depth2to5": set()}
 
@@ -157,7 +158,7 @@ def test_a_cell_of_ppo_has_its_mean_at_the_end_and_the_p_value_of_its_difference
     p_values = dict(zip(found, statistics.holm([each.p_value for each in found.values()]), strict=True))
     table = PAGE.read_text(encoding="utf-8").split("| `fo_b1_4tasks` | `fo_b1_4images` | `fo_b1_depth2to5` |")[1]
 
-    for method in by_agent.swept["method"]:
+    for method in by_agencomparison.METHODS:
         cells = table.split(f"| `{method}` | ")[1].split("\n")[0].strip("| ").split(" | ")
         for cell, axis in zip(cells, ("4tasks", "4images", "depth2to5"), strict=True):
             runs = by_agent.runs(axis, method, "ppo")

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 from studies.verdicts import (
     AGREES,
     DISAGREES,
     UNKNOWN,
     Effect,
+    compare_times,
     later,
     pairs,
-    seeds_that_would_do,
-    share_reached,
-    shares_later,
     undecided,
 )
 
@@ -73,11 +69,11 @@ def test_a_time_that_was_not_reached_is_later_than_all_that_were():
 
     slow = [{"seed": "0", "a": "", "b": "200"}, {"seed": "1", "a": "100", "b": ""}]
     fast = [{"seed": "0", "a": "900", "b": "100"}, {"seed": "1", "a": "100", "b": ""}]
-    assert shares_later(slow, fast, ("a", "b")) == [1.0, 0.0]
-    assert shares_later(fast, slow, ("a", "b")) == [-1.0, 0.0]
-    assert share_reached(slow, fast, ("a", "b")) == 0.75
+    words, effect = compare_times(slow, fast, ("a", "b"))
+    assert (words, effect.values, effect.room) == ("later in 3 of 4 pairs, earlier in 1", [1.0, 0.0], 0.75)
+    assert compare_times(fast, slow, ("a", "b"))[1].values == [-1.0, 0.0]
     emptied = [{**line, "a": "", "b": ""} for line in slow]
-    assert share_reached(emptied, emptied, ("a", "b")) == 0
+    assert compare_times(emptied, emptied, ("a", "b"))[1].room == 0
 
 
 @pytest.mark.parametrize("seeds", [["0", "2"], ["0"], ["0", "0"], []])
@@ -86,20 +82,12 @@ def test_pairs_have_equal_seeds_each_once(seeds):
         pairs([{"seed": seed} for seed in seeds], [{"seed": "0"}, {"seed": "1"}])
 
 
-def test_pairs_that_would_do_find_the_difference_at_the_level_of_all_comparisons():
-    found = statistics.compare([0.5, 0.4, 0.3, 0.1], [0.2, 0.3, 0.3, 0.2], bounds=(0, 1))
-
-    one, ten = (seeds_that_would_do(found, number) for number in (1, 10))
-    assert one == statistics.seeds_needed(found.difference.value, found.std, paired=True)
-    assert ten == statistics.seeds_needed(found.difference.value, found.std, paired=True, level=0.995) > one
-    equal = statistics.compare([0.5] * 3, [0.2] * 3)
-    assert seeds_that_would_do(equal) == 6 == math.ceil(math.log2(2 / 0.05))
-
-
 def test_a_difference_that_was_found_is_not_called_undecided():
     open_, found = (statistics.compare(values, [0.5] * 8, bounds=(0, 1)) for values in ([0.5, 0.6] * 4, [0.9] * 8))
+    one, ten = (statistics.pairs_needed(0.05, open_.std, number) for number in (1, 10))
 
-    assert undecided(open_) == f"0.05 [-0.34, 0.40] ({seeds_that_would_do(open_)} pairs would do)"
+    assert undecided(open_) == f"0.05 [-0.34, 0.40] ({one} pairs would do)"
+    assert undecided(statistics.corrected(dict.fromkeys(range(10), open_))[0]).endswith(f"({ten} pairs would do)")
     assert undecided(statistics.compare([0.4, 0.6] * 4, [0.5] * 8)).endswith("]")  # no difference
     with pytest.raises(ValueError, match=r"p = 0\.0078125 is not undecided"):
         undecided(found)

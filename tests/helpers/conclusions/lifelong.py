@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from studies.lifelong.experiments import MASKS, eight
+from studies.lifelong.comparison import MASKS
 from studies.verdicts import ALPHA
 
 from ctgraph_rl.report.statistics import compare
@@ -34,7 +34,7 @@ def _() -> bool:
     "tasks of CT8 and CT12 in every seed."
 )
 def _() -> bool:
-    many = [Table(eight(name)) for name in MASKS]
+    many = [Table(f"epochs/{name}") for name in MASKS]
     one = [Table(name) for name in ("masks_ct8", "masks_ct12")]
     return all(known(of, EWC) < of.own(EWC).double().mean() - 0.2 for of in many) and all(
         of.known(EWC).all() for of in one

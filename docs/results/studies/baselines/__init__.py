@@ -1,4 +1,1 @@
-"""What agents get on the tasks that each learned alone, and the main job: the page baselines.md.
-
-`page` makes it; the other modules are of its sections.
-"""
+"""What agents get on the tasks that each learned alone, and the main job: the page baselines.md."""

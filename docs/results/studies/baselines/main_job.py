@@ -10,14 +10,12 @@ from ctgraph_rl.draw.task_figure import draw_task
 from ctgraph_rl.report.figures.heatmaps import draw_performance
 from ctgraph_rl.report.statistics import Estimate, mean
 from ctgraph_rl.tasks.configurations import ct_su_b1
-from studies.raw import groups, read
-
-SIZE = 9.0, 4.2
+from studies.raw import groups, numbers_in, read
 
 
 def draw(path: Path) -> None:
     """Draw both parts from the raw results, and write the picture."""
-    figure = new_figure(*SIZE)
+    figure = new_figure(9.0, 4.2)
     tree, matrix = figure.subplots(1, 2, width_ratios=[1, 1])
     draw_task(tree, ct_su_b1())
     tree.set_title("CT-SU-B1: two decisions, one reward", fontsize=10)
@@ -29,13 +27,8 @@ def draw(path: Path) -> None:
 
 def performance() -> tuple[list[str], list[list[Estimate]]]:
     """Return the labels of the tasks, and for each block the mean over seeds on each task, without intervals."""
-    raw = read("main_job")
-    labels = list(dict.fromkeys(line["label"] for line in raw))
-    cells = groups(raw, "block", "label")
-    blocks = dict.fromkeys(line["block"] for line in raw)
-    return labels, [[_mean(cells[block, label]) for label in labels] for block in blocks]
-
-
-def _mean(lines: list[dict[str, str]]) -> Estimate:
-    found = mean([float(line["return_mean"]) for line in lines], bounds=(0, 1))
-    return dataclasses.replace(found, low=None, high=None)
+    rows: dict[str, dict[str, Estimate]] = {}
+    for (block, label), lines in groups(read("main_job"), "block", "label").items():
+        found = mean(numbers_in(lines, "return_mean"), bounds=(0, 1))
+        rows.setdefault(block, {})[label] = dataclasses.replace(found, low=None, high=None)
+    return list(rows["0"]), [list(row.values()) for row in rows.values()]

@@ -1,4 +1,4 @@
 """What methods keep and gain on sequences of tasks: the page lifelong.md.
 
-`comparison` and `pairs` make its tables, `experiments` says what was to run.
+`comparison` and `pairs` make its tables.
 """

@@ -1,21 +1,44 @@
-"""Tables and figures of runs with methods, made of the raw results of `studies.lifelong.runs`."""
+"""Tables and figures of runs with methods."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
-from itertools import product
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from ctgraph_rl import metrics
+from ctgraph_rl.draw.style import new_figure, save_figure
 from ctgraph_rl.metrics import METRICS, Curves
 from ctgraph_rl.metrics.bounds import Known
-from studies.lifelong.experiments import MASKS, expected
-from studies.raw import Raw, groups, mean_of, read, shown, table
+from studies.figures import draw_grid
+from studies.raw import Raw, groups, mean_of, read, select, shown, table
 from studies.two_groups import two_groups
+
+MASKS = ("masks_ct8_md", "masks_ct8", "masks_ct12")
+"""The published comparison on its three curricula."""
+
+MASK_METHODS = ("finetune", "mask_lc", "ewc_published", "mask_ri", "mask_blc")
+
+CURRICULA = ("fo_b1_4tasks", "fo_b1_4images", "fo_b1_depth2to5")
+AGENTS = ("ppo", "a2c", "dqn", "lstm_ppo")
+METHODS = (
+    "finetune",
+    "scratch",
+    "multitask",
+    "l2",
+    "ewc",
+    "si",
+    "mas",
+    "clear",
+    "packnet",
+    "mask_ri",
+    "mask_lc",
+    "mask_blc",
+)
+"""What `methods` compares, in the order of the page."""
 
 EXPERT = "expert"
 """The method of lines that have what each single-task expert of a seed gets on its own task after so many frames."""
@@ -83,57 +106,44 @@ def transfer(runs: np.ndarray, experts: np.ndarray, left_out: Sequence[int]) -> 
     return shown(two_groups(runs[:, kept], experts[:, kept], forward_transfer, RETURNS))
 
 
-OF_A_RUN = {
+COLUMNS = {
     "average performance": "continual_world_performance",
+    "forward transfer": "",
     "forgetting": "continual_world_forgetting",
     "TPOT": "total_performance_over_time",
     "tasks learned": "tasks_learned",
     "known at the end": "tasks_learned",
 }
-"""Columns that a run has without experts, with the metrics that say their bounds."""
-
-COLUMNS = (
-    "average performance",
-    "forward transfer",
-    "forgetting",
-    "TPOT",
-    "tasks learned",
-    "known at the end",
-)
+"""Columns with the metrics that say their bounds; forward transfer also needs the experts."""
 
 
 def summary(name: str) -> str:
     """A line for each method: every number's mean over seeds with its interval; then what was left out."""
-    of = groups(read(name), "method", "seed")
-    if not of:
-        return f"Nothing was run yet: `ctgraph-rl -m experiment={name}`."
-    experts = [lines for (who, _), lines in of.items() if who == EXPERT]
-    alone, left_out, rows = expert_areas(experts), full(experts), []
-    for method in dict.fromkeys(expected(name)["method"]):
-        runs = [lines for (who, _), lines in of.items() if who == method]
-        found, own = [scores(lines) for lines in runs], areas(runs)
-        values = {"forward transfer": transfer(own, alone, left_out)}
-        values |= {column: mean_of([each[column] for each in found], bounds(column, runs[0])) for column in OF_A_RUN}
-        rows.append([f"`{method}`", *(values[column] for column in COLUMNS)])
+    experts = list(groups(select(read(name), method=EXPERT), "seed").values())
+    alone = expert_areas(experts)
+    left_out = full(experts)
+    rows = []
+    for method in MASK_METHODS:
+        runs = list(groups(select(read(name), method=method), "seed").values())
+        found = [scores(lines) for lines in runs]
+        row = [f"`{method}`"]
+        for column, metric in COLUMNS.items():
+            if metric:
+                row.append(mean_of([each[column] for each in found], bounds(metric, runs[0])))
+            else:
+                row.append(transfer(areas(runs), alone, left_out))
+        rows.append(row)
     tasks = f"task {', '.join(map(str, left_out))}" if left_out else "none"
     seeds = f"{len(experts)} seeds of each method and of the experts."
-    said = f"{seeds} Left out of forward transfer: {tasks}."
-    return f"{table(['method', *COLUMNS], rows)}\n\n{said}"
+    return f"{table(['method', *COLUMNS], rows)}\n\n{seeds} Left out of forward transfer: {tasks}."
 
 
-def bounds(column: str, lines: Raw) -> tuple[float, float]:
-    """The lowest and the highest value of a column."""
+def bounds(metric: str, lines: Raw) -> tuple[float, float]:
+    """The lowest and the highest value of a metric."""
     run = curves(lines)
     evaluations, tasks = run.performance.shape
     known = Known(*RETURNS, tasks=tasks, evaluations=evaluations, lowest_share=0.0, highest_share=1.0)
-    return METRICS[OF_A_RUN[column]].bounds(known)
-
-
-def seeds_of(lines: Raw, agent: str) -> str:
-    """How many seeds the cells of an agent have, such as ``n = 2 to 3``."""
-    cells = groups([line for line in lines if line["agent"] == agent], "curriculum", "method").values()
-    counts = sorted({len(groups(cell, "seed")) for cell in cells})
-    return f"n = {' to '.join(map(str, dict.fromkeys([counts[0], counts[-1]])))}"
+    return METRICS[metric].bounds(known)
 
 
 def returns_at_end(lines: Raw) -> list[float]:
@@ -143,63 +153,31 @@ def returns_at_end(lines: Raw) -> list[float]:
 
 def draw(name: str, path: Path) -> None:
     """The mean return over all tasks after so many frames: a line for each method, thin ones for its seeds."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    of = groups(read(name), "method")
-    figure, axes = pyplot.subplots(figsize=(6.4, 3.2))
-    for number, method in enumerate(expected(name)["method"]):
-        runs = [curves(lines) for lines in groups(of.get((method,), []), "seed").values()]
-        each = [run.performance.mean(1) for run in runs]
-        for run, values in zip(runs, each, strict=True):
-            axes.plot(_thousands(run), values, color=f"C{number}", linewidth=0.5, alpha=0.5)
-        if each:
-            label = f"{method} (n = {len(each)})"
-            axes.plot(_thousands(runs[0]), torch.stack(each).mean(0), color=f"C{number}", linewidth=1.6, label=label)
-            starts = [place for place, block in enumerate(runs[0].blocks) if block > runs[0].blocks[max(place - 1, 0)]]
-            axes.vlines(_thousands(runs[0])[starts], 0, 1, color="0.9", linewidth=0.7, zorder=0)
-    axes.set_xlabel("thousand frames")
-    axes.set_ylabel("mean return over all tasks")
-    axes.set_ylim(-0.02, 1.02)
+    figure = new_figure(6.4, 3.2)
+    axes = figure.subplots()
+    for number, method in enumerate(MASK_METHODS):
+        runs = [curves(lines) for lines in groups(select(read(name), method=method), "seed").values()]
+        returns = torch.stack([run.performance.mean(1) for run in runs])
+        thousands = torch.tensor(runs[0].frames) / 1e3
+        axes.plot(thousands, returns.T, color=f"C{number}", linewidth=0.5, alpha=0.5)
+        label = f"{method} (n = {len(runs)})"
+        axes.plot(thousands, returns.mean(0), color=f"C{number}", linewidth=1.6, label=label)
+    starts = torch.tensor(runs[0].blocks).diff().nonzero()[:, 0] + 1
+    axes.vlines(thousands[starts], 0, 1, color="0.9", linewidth=0.7, zorder=0)
+    axes.set(xlabel="thousand frames", ylabel="mean return over all tasks", ylim=(-0.02, 1.02))
     axes.legend(fontsize=7, frameon=False)
-    figure.tight_layout()
-    figure.savefig(path, dpi=150)
-    pyplot.close(figure)
+    save_figure(figure, path)
 
 
 def draw_by_agent(path: Path) -> None:
     """The mean over seeds of the return at the end: a panel for each curriculum, methods by agents."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    raw, swept = read("methods"), expected("methods")
-    of = groups(raw, "curriculum", "method", "agent")
-    figure, panels = pyplot.subplots(1, len(swept["curriculum"]), figsize=(7.2, 3.6), sharey=True)
-    for axes, curriculum in zip(panels, swept["curriculum"], strict=True):
-        cells = torch.full([len(swept["method"]), len(swept["agent"])], torch.nan)
-        for (row, method), (column, agent) in product(enumerate(swept["method"]), enumerate(swept["agent"])):
-            if lines := of.get((curriculum, method, agent)):
-                value = cells[row, column] = torch.tensor(returns_at_end(lines)).mean()
-                colour = "white" if value < 0.6 else "black"
-                axes.text(column, row, f"{value:.2f}", ha="center", va="center", fontsize=7, color=colour)
-        axes.imshow(cells, vmin=0, vmax=1, cmap="viridis", aspect="auto")
+    figure = new_figure(7.2, 3.6)
+    panels = figure.subplots(1, len(CURRICULA), sharey=True)
+    for axes, curriculum in zip(panels, CURRICULA, strict=True):
+        of = groups(select(read("methods"), curriculum=curriculum), "method", "agent")
+        rows = [[np.mean(returns_at_end(of[method, agent])) for agent in AGENTS] for method in METHODS]
+        counts = [len(groups(of[METHODS[0], agent], "seed")) for agent in AGENTS]
+        agents = [f"{agent}\nn = {count}" for agent, count in zip(AGENTS, counts, strict=True)]
+        draw_grid(axes, rows, "{:.2f}", METHODS, agents)
         axes.set_title(curriculum, fontsize=9)
-        labels = [f"{agent}\n{seeds_of(raw, agent)}" for agent in swept["agent"]]
-        axes.set_xticks(range(len(labels)), labels, fontsize=6)
-        axes.set_yticks(range(len(swept["method"])), swept["method"], fontsize=7)
-    figure.tight_layout()
-    figure.savefig(path, dpi=150)
-    pyplot.close(figure)
-
-
-def _thousands(run: Curves) -> torch.Tensor:
-    return torch.tensor(run.frames) / 1e3
-
-
-def tables(names: Sequence[str] = MASKS) -> dict[str, str]:
-    """What the template of the page names."""
-    return {name: summary(name) for name in names}
+    save_figure(figure, path)

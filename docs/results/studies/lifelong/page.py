@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from string import Template
+from pathlib import Path
 
 from ctgraph_rl.report import statistics
 from studies.lifelong import comparison, pairs
-from studies.lifelong.experiments import EXPERIMENTS, MASKS, eight
-from studies.raw import HERE, TEMPLATES, machines, read
+from studies.lifelong.comparison import MASKS
+from studies.raw import fill, machines
 from studies.verdicts import undecided
-
-PAGE = HERE / "lifelong.md"
 
 SHORT = {
     "finetune": "fine-tuned PPO",
@@ -30,28 +28,26 @@ def differences() -> dict[str, str]:
     for name in ("masks_ct8", "masks_ct12"):
         areas = pairs.compare_areas(name)
         (one, other), each = pairs.clearest(areas)
-        found[f"{name}_clearest"] = f"{SHORT[one]} less {SHORT[other]}, {undecided(each, len(areas))}"
+        found[f"{name}_clearest"] = f"{SHORT[one]} less {SHORT[other]}, {undecided(each)}"
     last = pairs.last_depth(LAST)
-    found["last_depth"] = "; ".join(f"{SHORT[name]} {undecided(last[name], len(last))}" for name in LAST[:3])
+    found["last_depth"] = "; ".join(f"{SHORT[name]} {undecided(last[name])}" for name in LAST[:3])
     ends = statistics.corrected(pairs.against_finetuning(["ppo"]))
     deep = {name: each for name, each in ends.items() if name.startswith("fo_b1_depth2to5")}
     name, each = pairs.clearest(deep)
-    found["growing_clearest"] = f"{name.split(', ')[1]}, {undecided(each, len(ends))}"
+    found["growing_clearest"] = f"{name.split(', ')[1]}, {undecided(each)}"
     return found
 
 
 def page() -> str:
-    """The page of the methods: its template with its tables."""
-    template = Template((TEMPLATES / "lifelong.md").read_text(encoding="utf-8"))
-    found = comparison.tables() | pairs.tables() | differences()
-    read_here = (*EXPERIMENTS, *map(eight, MASKS))
-    return template.substitute(found, machines=machines(*read_here))
+    """The page of the methods."""
+    found = {name: comparison.summary(name) for name in MASKS}
+    found |= {"claims": pairs.rows(pairs.claims()), "methods_ppo": pairs.by_ppo()}
+    found["machines"] = machines(*MASKS, *(f"epochs/{name}" for name in MASKS), "methods")
+    return fill("lifelong", found | differences())
 
 
-def make() -> None:
-    """Write the page and its figures."""
-    PAGE.write_text(page(), encoding="utf-8")
+def draw(folder: Path) -> None:
+    """Draw the figures."""
     for name in MASKS:
-        if read(name):
-            comparison.draw(name, HERE / f"{name}.png")
-    comparison.draw_by_agent(HERE / "methods.png")
+        comparison.draw(name, folder / f"{name}.png")
+    comparison.draw_by_agent(folder / "methods.png")

@@ -8,7 +8,7 @@ seed. Five pairs have no p-value below 0.06, so pairs of several agents are test
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
@@ -17,8 +17,8 @@ from ctgraph_rl.metrics import MASTERED
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.statistics import Comparison
 from studies.lifelong import comparison
-from studies.lifelong.experiments import MASKS, expected
-from studies.raw import Raw, groups, mean_of, read, shown, table
+from studies.lifelong.comparison import CURRICULA, MASKS, RETURNS, returns_at_end
+from studies.raw import Raw, groups, mean_of, read, select, shown, table
 from studies.verdicts import ALPHA
 
 COMBINED, ALONE, OTHERS = ("mask_lc", "mask_blc"), "mask_ri", ("finetune", "ewc_published")
@@ -56,12 +56,17 @@ def claims() -> dict[str, Comparison]:
     return found
 
 
+def by_method(lines: Raw, measure: Callable[[Raw], float]) -> dict[str, list[float]]:
+    """Return a number of each run by method, in the order of seeds."""
+    found: dict[str, list[float]] = {}
+    for (method, _), run in sorted(groups(lines, "method", "seed").items(), key=lambda cell: int(cell[0][1])):
+        found.setdefault(method, []).append(measure(run))
+    return found
+
+
 def compare_areas(name: str) -> dict[tuple[str, str], Comparison]:
     """Compare all pairs of methods of a table by the mean return over all blocks, p-values corrected for all."""
-    of = groups(read(name), "method", "seed")
-    areas: dict[str, list[float]] = {}
-    for (method, _), lines in sorted(of.items(), key=lambda cell: int(cell[0][1])):
-        areas.setdefault(method, []).append(while_learning(lines))
+    areas = by_method(read(name), while_learning)
     found = {}
     for one, other in combinations(METHODS, 2):
         found[one, other] = statistics.compare(areas[one], areas[other], bounds=(0, 1))
@@ -77,11 +82,8 @@ def clearest(found: Mapping[Any, Comparison]) -> tuple[Any, Comparison]:
 
 def last_depth(methods: Sequence[str]) -> dict[str, Comparison]:
     """Compare PPO with each method and fine-tuned PPO by depth 5 in its own block, p-values corrected for all."""
-    raw = [line for line in read("methods") if (line["curriculum"], line["agent"]) == ("fo_b1_depth2to5", "ppo")]
-    learned: dict[str, list[float]] = {}
-    for (method, _), lines in sorted(groups(raw, "method", "seed").items(), key=lambda cell: int(cell[0][1])):
-        last = comparison.curves(lines).ends[-1, -1]
-        learned.setdefault(method, []).append(float(last >= MASTERED))
+    lines = select(read("methods"), curriculum="fo_b1_depth2to5", agent="ppo")
+    learned = by_method(lines, lambda run: float(comparison.curves(run).ends[-1, -1] >= MASTERED))
     found = {name: statistics.compare(learned[name], learned[BASE], bounds=(0, 1)) for name in methods}
     return statistics.corrected(found)
 
@@ -96,12 +98,12 @@ def over_curricula(measured: Mapping[tuple[str, ...], float]) -> Measured:
 
 def against_finetuning(agents: Collection[str]) -> dict[str, Comparison]:
     """Each method against fine-tuning on each curriculum, pairs of some agents, by the mean return at the end."""
-    raw = [line for line in read("methods") if line["agent"] in agents]
-    of = groups(raw, "curriculum", "method", "agent", "seed")
-    swept, found = expected("methods"), {}
-    for curriculum in swept["curriculum"]:
-        measured = {cell[1:]: at_the_end(lines) for cell, lines in of.items() if cell[0] == curriculum}
-        for method in swept["method"]:
+    lines = [line for line in read("methods") if line["agent"] in agents]
+    found = {}
+    for curriculum in CURRICULA:
+        of = groups(select(lines, curriculum=curriculum), "method", "agent", "seed")
+        measured = {cell: at_the_end(run) for cell, run in of.items()}
+        for method in comparison.METHODS:
             if method != BASE:
                 found[f"{curriculum}, `{method}`"] = of_pairs(measured, method, BASE)
     return found
@@ -109,19 +111,18 @@ def against_finetuning(agents: Collection[str]) -> dict[str, Comparison]:
 
 def by_ppo() -> str:
     """A line for each method, a column for each curriculum: PPO's return at the end, and p against fine-tuning."""
-    cells = groups([line for line in read("methods") if line["agent"] == "ppo"], "method", "curriculum")
-    found = against_finetuning(["ppo"])
-    corrected = dict(zip(found, statistics.holm([each.p_value for each in found.values()]), strict=True))
-    swept = expected("methods")
+    cells = groups(select(read("methods"), agent="ppo"), "method", "curriculum")
+    tested = statistics.corrected(against_finetuning(["ppo"]))
     lines = []
-    for method in swept["method"]:
+    for method in comparison.METHODS:
         line = [f"`{method}`"]
-        for curriculum in swept["curriculum"]:
-            mean = mean_of(comparison.returns_at_end(cells[method, curriculum]), comparison.RETURNS)
-            p_value = corrected.get(f"{curriculum}, `{method}`")
-            line.append(mean if p_value is None else f"{mean}, p {_p(p_value)}")
+        for curriculum in CURRICULA:
+            cell = mean_of(returns_at_end(cells[method, curriculum]), RETURNS)
+            if method != BASE:
+                cell += f", p {_p(tested[f'{curriculum}, `{method}`'].holm)}"
+            line.append(cell)
         lines.append(line)
-    return table(["", *(f"`{curriculum}`" for curriculum in swept["curriculum"])], lines)
+    return table(["", *(f"`{curriculum}`" for curriculum in CURRICULA)], lines)
 
 
 def of_pairs(measured: Mapping[tuple[str, ...], float], first: str, second: str) -> Comparison:
@@ -137,20 +138,11 @@ def of_pairs(measured: Mapping[tuple[str, ...], float], first: str, second: str)
 
 def rows(found: Mapping[str, Comparison]) -> str:
     """A line for each comparison, its p-value corrected for all of them."""
-    corrected = statistics.holm([each.p_value for each in found.values()])
-    lines = [_row(name, each, p) for (name, each), p in zip(found.items(), corrected, strict=True)]
+    lines = []
+    for name, each in statistics.corrected(found).items():
+        lines.append([name, shown(each.difference), f"{each.wins}, {each.ties}, {each.losses}", _p(each.holm)])
     return table(["", "difference", "better, equal, worse", "p (Holm)"], lines)
-
-
-def _row(name: str, each: Comparison, corrected: float | None) -> list[str]:
-    record = ", ".join(map(str, (each.wins, each.ties, each.losses)))
-    return [name, shown(each.difference), record, _p(corrected)]
 
 
 def _p(value: float | None) -> str:
     return "-" if value is None else "< 0.001" if value < 0.001 else f"{value:.3f}"
-
-
-def tables() -> dict[str, str]:
-    """What the template of the page names."""
-    return {"claims": rows(claims()), "methods_ppo": by_ppo()}

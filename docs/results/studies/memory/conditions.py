@@ -1,20 +1,45 @@
-"""The graphs of the experiment ``memory_cells``, and what is finished on each."""
+"""The graphs and agents of the experiment ``memory_cells``, and what is finished on each."""
 
 from __future__ import annotations
 
-from itertools import product
+from collections.abc import Mapping
 from typing import NamedTuple
 
-from studies.memory.runs import AGENTS, SEEDS
-from studies.raw import Raw, groups, read
+from studies.raw import Raw, groups, numbers_in, read
 
 NAME = "memory_cells"
+
+SEEDS = 5
+
+SOLVED = 0.9
+"""The least greedy return of a seed that solves a task; the optimum is 1."""
 
 NOISE = "25"
 """The largest addition to each pixel in the conditions with noise."""
 
 GUIDED = "204800"
 """The frames over which a policy that navigates gives the first rewards."""
+
+AGENTS = {
+    "lstm_ppo": "LSTM",
+    "lstm_ppo-gru": "GRU",
+    "lstm_ppo-min_gru": "minGRU",
+    "lstm_ppo-amrl_max": "AMRL-Max",
+    "lstm_ppo-amrl_avg": "AMRL-Avg",
+    "lstm_ppo-backpropamine": "Backpropamine",
+    "lstm_ppo-attention": "attention",
+    "lstm_ppo-frames": "frame stacking",
+    "lstm_ppo-none": "PPO (no memory)",
+    "a2c, 8 steps": "A2C (8 steps)",
+    "a2c, 32 steps": "A2C (32 steps)",
+    "reinforce, 8 steps": "REINFORCE (8 steps)",
+    "reinforce, 128 steps": "REINFORCE (128 steps)",
+    "dqn, 1 step": "DQN (1 step)",
+    "dqn, 6 steps": "DQN (6 steps)",
+    "qrdqn_lstm": "QRDQN+LSTM",
+    "mohqa": "MOHQA",
+}
+"""Names of agents with their cells, in the order of the page; PPO where no other algorithm is named."""
 
 
 class Condition(NamedTuple):
@@ -26,28 +51,13 @@ class Condition(NamedTuple):
     guide_frames: str = GUIDED
     read_noise: str = "0"
 
-    def __str__(self) -> str:
-        """Return the condition in words."""
-        noise = f", noise up to {self.read_noise}" if self.read_noise != "0" else ""
-        return f"p = {self.wait_prob}, {self.graph}, {self.rewards}{noise}"
-
-    @property
-    def graph(self) -> str:
-        """Return what differs between graphs with the same waits, in words."""
-        return f"{self.num_wait_images} wait images, {self.decisions} decisions"
-
     @property
     def decisions(self) -> str:
         """Return how decision states look."""
         return "unique" if self.unique_decisions == "True" else "shared"
 
-    @property
-    def rewards(self) -> str:
-        """Return where the first rewards come from."""
-        return "first rewards given" if self.guide_frames != "0" else "first rewards to be found"
 
-
-GRAPHS = list(product(("False", "True"), ("100", "500")))
+GRAPHS = [("False", "100"), ("False", "500"), ("True", "100"), ("True", "500")]
 """Unique decisions and wait images of the graphs with random waiting."""
 
 GIVEN = [
@@ -57,24 +67,43 @@ GIVEN = [
 """The conditions with first rewards given, in the order of the page; the first one is CT-CO-B1."""
 
 TO_FIND = [Condition("0.9", unique, "500", "0") for unique in ("False", "True")]
-NOISY = [
-    Condition(wait_prob, "False", images, GUIDED, NOISE) for wait_prob in ("0.5", "0.9") for images in ("100", "500")
-]
-NOISY_AGENTS = ("lstm_ppo", "lstm_ppo-gru")
 SHARED, UNIQUE = Condition("0.9", "False", "500"), Condition("0.9", "True", "500")
 """The graphs that the published claim can be about, with first rewards given."""
 
 
 def finished() -> dict[Condition, dict[str, Raw]]:
-    """Return the lines of each condition and agent with all seeds, agents in the order of the page."""
+    """Return the lines of each condition and agent, agents in the order of the page."""
     found: dict[Condition, dict[str, Raw]] = {}
     for condition, lines in groups(read(NAME), *Condition._fields).items():
-        of = {agent: each for (agent,), each in groups(lines, "agent").items() if len(each) == SEEDS}
-        found[Condition(*condition)] = {agent: of[agent] for agent in AGENTS if agent in of}
+        of = groups(lines, "agent")
+        found[Condition(*condition)] = {agent: of[agent,] for agent in AGENTS if (agent,) in of}
     return found
 
 
-def columns(conditions: list[Condition]) -> dict[Condition, dict[str, Raw]]:
-    """Return what is finished of some conditions, in their order."""
-    of = finished()
-    return {condition: of.get(condition, {}) for condition in conditions}
+def solved(lines: Raw) -> list[bool]:
+    """Return for each seed whether it solves the task after training."""
+    return [value >= SOLVED for value in numbers_in(lines, "greedy_return")]
+
+
+def solved_once(lines: Raw) -> list[bool]:
+    """Return for each seed whether it solves the task at any evaluation."""
+    return [bool(line["frames_to_90"]) for line in lines]
+
+
+def count(lines: Raw) -> str:
+    """Return how many seeds solve the task after training, as ``4 of 5``."""
+    return f"{sum(solved(lines))} of {len(lines)}"
+
+
+def ranking(of: Mapping[str, Raw]) -> str:
+    """Return the agents by how many seeds solve the task after training, as ``4 of 5: LSTM, GRU; 0 of 5: A2C``."""
+    by_count: dict[int, list[str]] = {}
+    for name, lines in of.items():
+        by_count.setdefault(sum(solved(lines)), []).append(AGENTS[name])
+    last = min(by_count)
+    if len(by_count) == 1:
+        return f"{last} of {SEEDS} with all {len(of)} agents"
+    parts = [f"{number} of {SEEDS}: {', '.join(by_count[number])}" for number in sorted(by_count, reverse=True)]
+    if len(by_count[last]) > 4:
+        parts[-1] = f"{last} of {SEEDS}: the other {len(by_count[last])}"
+    return "; ".join(parts)

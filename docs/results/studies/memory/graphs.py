@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Mapping, Sequence
+from statistics import fmean
 
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.statistics import Comparison
 from studies.memory.conditions import (
+    AGENTS,
     GIVEN,
     NOISE,
-    NOISY,
-    NOISY_AGENTS,
     SHARED,
     TO_FIND,
     UNIQUE,
     Condition,
-    columns,
+    count,
     finished,
+    solved,
+    solved_once,
 )
-from studies.memory.runs import AGENTS, count, mean, returns, solved, solved_once
-from studies.raw import Raw, shown, table
+from studies.raw import Raw, numbers_in, shown, table
 from studies.verdicts import ALPHA, undecided
 
 RIVALS = (
@@ -40,7 +42,13 @@ RIVALS = (
 POOR = 1
 """The most seeds of five that solve a graph on which an agent is said to do poorly."""
 
-OF_CLAIM = [SHARED, TO_FIND[0], UNIQUE, TO_FIND[1]]
+OF_CLAIM = {
+    "shared, given": SHARED,
+    "shared, to be found": TO_FIND[0],
+    "unique, given": UNIQUE,
+    "unique, to be found": TO_FIND[1],
+}
+"""The graphs that the claim can be about, by decisions and first rewards."""
 
 
 def ceiling(of: Mapping[str, Raw]) -> float:
@@ -51,51 +59,46 @@ def ceiling(of: Mapping[str, Raw]) -> float:
 def with_noise() -> str:
     """Return how many of all runs with noise solve the task after training, and of those without."""
     of = finished()
-    noise, plain = (
-        [line for noisy in NOISY for name in NOISY_AGENTS for line in of[noisy._replace(read_noise=level)][name]]
-        for level in (NOISE, "0")
-    )
+    noise: Raw = []
+    plain: Raw = []
+    for condition in GIVEN:
+        noisy = condition._replace(read_noise=NOISE)
+        if noisy in of:
+            for name in ("lstm_ppo", "lstm_ppo-gru"):
+                noise += of[noisy][name]
+                plain += of[condition][name]
     return f"{count(noise)} runs with noise and {count(plain)} without"
 
 
 def totals() -> dict[str, Raw]:
-    """Return the lines of each agent on all graphs with first rewards given, of those that ran on all."""
-    each = columns(GIVEN).values()
-    return {name: [line for of in each for line in of[name]] for name in AGENTS if all(name in of for of in each)}
+    """Return the lines of each agent on all graphs with first rewards given."""
+    of = finished()
+    return {name: [line for condition in GIVEN for line in of[condition][name]] for name in AGENTS}
 
 
 def compared(of: Mapping[str, Raw]) -> dict[str, Comparison]:
     """Return the paired comparison of each agent's greedy returns with the LSTM's, p-values corrected for all."""
-    base = returns(of["lstm_ppo"])
-    found = {name: statistics.compare(returns(of[name]), base, bounds=(0, 1)) for name in of if name != "lstm_ppo"}
-    return statistics.corrected(found)
+    returns = {name: numbers_in(lines, "greedy_return") for name, lines in of.items()}
+    base = returns.pop("lstm_ppo")
+    return statistics.corrected({name: statistics.compare(each, base, bounds=(0, 1)) for name, each in returns.items()})
 
 
 def total_table() -> str:
     """Return a line for each agent: how many of all runs solve the task, and the difference from the LSTM."""
     of = totals()
-    comparisons, rows = compared(of), []
+    comparisons = compared(of)
+    rows = []
     for name in sorted(of, key=lambda name: -sum(solved(of[name]))):
         lines = of[name]
-        row = [
-            AGENTS[name],
-            f"{sum(solved(lines))}",
-            f"{sum(solved_once(lines))}",
-            f"{mean(lines, 'greedy_return'):.2f}",
-        ]
+        mean = fmean(numbers_in(lines, "greedy_return"))
+        row = [AGENTS[name], str(sum(solved(lines))), str(sum(solved_once(lines))), f"{mean:.2f}"]
         if name in comparisons:
-            comparison = comparisons[name]
-            row += [shown(comparison.difference), f"{comparison.holm:.3f}"]
-        rows.append([*row, "", ""][:6])
-    number = len(next(iter(of.values())))
-    heads = [
-        f"solved after training, of {number}",
-        "at any evaluation",
-        "greedy return",
-        "difference from the LSTM",
-        "p",
-    ]
-    return table(["", *heads], rows)
+            row += [shown(comparisons[name].difference), f"{comparisons[name].holm:.3f}"]
+        else:
+            row += ["", ""]
+        rows.append(row)
+    heads = [f"solved after training, of {len(lines)}", "at any evaluation", "greedy return"]
+    return table(["", *heads, "difference from the LSTM", "p"], rows)
 
 
 def lower_and_undecided() -> tuple[str, str]:
@@ -106,10 +109,9 @@ def lower_and_undecided() -> tuple[str, str]:
     """
     lower: list[str] = []
     others: list[str] = []
-    found = compared(totals())
-    for name, comparison in found.items():
+    for name, comparison in compared(totals()).items():
         if (comparison.holm or 0) > ALPHA:
-            others.append(f"{AGENTS[name]} {undecided(comparison, len(found))}")
+            others.append(f"{AGENTS[name]} {undecided(comparison)}")
         elif (comparison.difference.value or 0) > 0:
             raise ValueError(f"{name} has higher returns than the LSTM: the page says otherwise")
         else:
@@ -119,14 +121,17 @@ def lower_and_undecided() -> tuple[str, str]:
 
 def lost() -> str:
     """Return how many runs that solved the task at an evaluation did not after training, by agent; without noise."""
-    each = columns([*GIVEN, *TO_FIND]).values()
-    runs = {name: [line for of in each for line in of.get(name, [])] for name in AGENTS}
-    once = {name: [line for line in lines if line["frames_to_90"]] for name, lines in runs.items()}
-    gone = {name: len(lines) - sum(solved(lines)) for name, lines in once.items()}
-    worst = sorted((name for name in once if gone[name]), key=lambda name: -gone[name] / len(once[name]))
-    parts = [f"{AGENTS[name]} {gone[name]} of {len(once[name])}" for name in worst]
-    whole = f"Of {sum(map(len, once.values()))} runs that solved the task at an evaluation, {sum(gone.values())}"
-    return f"{whole} did not after training: {', '.join(parts)}"
+    of = finished()
+    once = {}
+    gone = {}
+    for name in AGENTS:
+        lines = [line for condition in (*GIVEN, *TO_FIND) for line in of[condition].get(name, [])]
+        once[name] = sum(solved_once(lines))
+        gone[name] = sum(map(operator.gt, solved_once(lines), solved(lines)))
+    worst = sorted((name for name in AGENTS if gone[name]), key=lambda name: -gone[name] / once[name])
+    parts = ", ".join(f"{AGENTS[name]} {gone[name]} of {once[name]}" for name in worst)
+    whole = f"Of {sum(once.values())} runs that solved the task at an evaluation, {sum(gone.values())}"
+    return f"{whole} did not after training: {parts}"
 
 
 def cut_off(steps: int) -> str:
@@ -154,21 +159,21 @@ def _share_cut_off(wait_prob: float, steps: int, depth: int = 2) -> float:
 
 
 def claim_table() -> str:
-    """Return a line for each rival and MOHQA, a column for each graph that the claim can be about."""
-    of = columns(OF_CLAIM)
-    heads = [f"{each.decisions}, {each.rewards.removeprefix('first rewards ')}" for each in OF_CLAIM]
-    rows = [[AGENTS[name], *(short(each.get(name)) for each in of.values())] for name in (*RIVALS, "mohqa")]
-    return table(["", *heads], rows)
+    """Return a line for each rival and MOHQA, a column for each graph that the claim can be about.
 
-
-def short(lines: Raw | None) -> str:
-    """Return the seeds that solve the task after training, in brackets at any evaluation."""
-    return f"{sum(solved(lines))} ({sum(solved_once(lines))})" if lines else "not run"
+    Cells are the seeds that solve the task after training, in brackets at any evaluation.
+    """
+    of = finished()
+    rows = []
+    for name in (*RIVALS, "mohqa"):
+        cells = [of[condition][name] for condition in OF_CLAIM.values()]
+        rows.append([AGENTS[name], *(f"{sum(solved(lines))} ({sum(solved_once(lines))})" for lines in cells)])
+    return table(["", *OF_CLAIM], rows)
 
 
 def better_than_poor(condition: Condition) -> str:
     """Return the rivals that more than `POOR` seeds solve a graph with."""
-    of = columns([condition])[condition]
+    of = finished()[condition]
     return listed([AGENTS[name] for name in RIVALS if sum(solved(of[name])) > POOR])
 
 
