@@ -31,7 +31,7 @@ def label_strips(section: Section) -> CaptionedFigure | None:
     caption = (
         "Labels that learners gave to tasks themselves, over the frames of each run. Top: the true tasks, by number. "
         "Numbers in strips: labels, in the order in which they were opened; colour: the task in most of whose frames "
-        "the label acted. Pale: frames that were not learned from, while known labels were tried. Black marks below a "
+        "the label acted. Pale: frames that were not learned from, while known labels were tried. Red marks below a "
         f"strip: alarms. Dashed: changes of task.{left_out(len(runs), MOST_STRIPS, 'runs')} In evaluations each task "
         "is played with the label that acted in most of its frames: an oracle only in evaluation, which no learner "
         "sees."
@@ -45,7 +45,7 @@ def label_strips(section: Section) -> CaptionedFigure | None:
         _part(axes, 0, (start, end), text, colour=_colour(tasks[0] if len(tasks) == 1 else None), room=section.ends[-1])
     for row, (_, run) in enumerate(runs, 1):
         assert run.history is not None
-        _draw_strip(axes, row, run.history.spans, blocks, room=section.ends[-1])
+        draw_strip(axes, row, run.history.spans, blocks, room=section.ends[-1])
     for start, _, tasks in blocks[1:]:
         if tasks != next(before for _, end, before in blocks if end == start):
             axes.axvline(start, color="black", linestyle=(0, (3, 2)), linewidth=0.6)
@@ -57,7 +57,15 @@ def label_strips(section: Section) -> CaptionedFigure | None:
     return CaptionedFigure("labels", "Labels and true tasks", caption, figure)
 
 
-def _draw_strip(axes: Any, row: int, spans: Sequence[Span], blocks: Sequence[Any], room: float) -> None:
+def draw_strip(axes: Any, row: int, spans: Sequence[Span], blocks: Sequence[Any], room: float) -> None:
+    """Draw the labels of a run.
+
+    Args:
+        row: the strip's place.
+        spans: in time order.
+        blocks: first frame, frame after the last one, and trained tasks.
+        room: frames of the whole strip.
+    """
     of_label = {}
     for label, own in split_by(spans, lambda span: span.label).items():
         frames: dict[int, float] = {}
@@ -73,7 +81,7 @@ def _draw_strip(axes: Any, row: int, spans: Sequence[Span], blocks: Sequence[Any
         _part(axes, row, (span.start, span.end), str(span.label), colour=colour, room=room, opacity=opacity)
         if span.alarm:
             place = [span.end, span.end]
-            axes.plot(place, [row + 0.3, row + 0.48], color="black", linestyle="-", marker="", linewidth=1.2)
+            axes.plot(place, [row + 0.3, row + 0.48], color="tab:red", linestyle="-", marker="", linewidth=1.2)
 
 
 def _runs(section: Section) -> list[tuple[str, Run]]:

@@ -1,4 +1,1 @@
-"""What detectors of task changes find: the page no_labels.md.
-
-`learners` groups the raw results; `page` and `figures` show them.
-"""
+"""What detectors of task changes find: the page no_labels.md."""

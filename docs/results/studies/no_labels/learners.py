@@ -1,26 +1,16 @@
-"""The learners of the runs with detectors of task changes, and what is finished of each."""
+"""The learners of the runs with detectors of task changes."""
 
 from __future__ import annotations
 
-from functools import cache
-
-from studies.raw import Raw, groups, read
+from studies.raw import Raw, groups, numbers_in, read
 
 NAME, SPANS = "no_labels", "no_labels_spans"
 
 FOUND = ("detector", "method", "num_fresh", "boundaries")
 """The columns that tell the learners of a curriculum apart."""
 
-MASKS, PAIR = "swoks_2x4", "dick2020_pair"
+MASKS = "swoks_2x4"
 IMAGES = ("fo_b1_4images", "su_b1_4images", "co_b1_4images", "posr_b1_4images")
-
-PLANNED = {
-    (MASKS, "384000"): ("announced", "oracle", "swoks", "swoks, fresh", "adwin", "none"),
-    (PAIR, "51200"): ("announced", "oracle", "amd", "swoks", "adwin", "none"),
-    (PAIR, "204800"): ("announced", "oracle", "amd", "swoks, fresh", "adwin", "none"),
-    **{(name, "204800"): ("announced", "oracle", "swoks, fresh", "adwin", "none") for name in IMAGES},
-}
-"""Curricula, frames of a stay, and learners of the experiments."""
 
 SEEDS = 5
 
@@ -43,21 +33,25 @@ def learner(line: dict[str, str]) -> str:
     return "announced" if line["boundaries"] == "announced" else "none"
 
 
-@cache
-def finished() -> dict[tuple[str, str], dict[str, Raw]]:
-    """Return the lines of each curriculum and learner with all seeds, in the order of the page."""
-    found = groups(read(NAME), "curriculum", "stay")
-    of = {
-        place: {name: [line for line in found.get(place, []) if learner(line) == name] for name in names}
-        for place, names in PLANNED.items()
-    }
-    whole = {
-        place: {name: lines for name, lines in each.items() if len({line["seed"] for line in lines}) >= SEEDS}
-        for place, each in of.items()
-    }
-    return {place: each for place, each in whole.items() if each}
+def by_learner(name: str, *keys: str) -> dict[tuple[str, ...], dict[str, Raw]]:
+    """Return the lines of a table by some keys, then by learner, in the order of the page."""
+    found: dict[tuple[str, ...], dict[str, Raw]] = {}
+    for place, lines in groups(read(name), *keys).items():
+        of = {name: [line for line in lines if learner(line) == name] for name in LEARNERS}
+        found[place] = {name: own for name, own in of.items() if own}
+    return found
 
 
-def values(lines: Raw, name: str) -> list[float]:
-    """Return a metric of each seed."""
-    return [float(line[name]) for line in lines]
+def finished() -> dict[tuple[str, ...], dict[str, Raw]]:
+    """Return the lines by curriculum and frames of a stay, then by learner."""
+    return by_learner(NAME, "curriculum", "stay")
+
+
+def share(lines: Raw, column: str) -> float:
+    """Return what share of all frames of some runs a column has."""
+    return sum(numbers_in(lines, column)) / sum(numbers_in(lines, "frames"))
+
+
+def returns(lines: Raw, column: str) -> tuple[list[float], tuple[float, float]]:
+    """Return a column with the bounds of returns, one number for each seed."""
+    return numbers_in(lines, column), (float(lines[0]["lowest_return"]), float(lines[0]["highest_return"]))
