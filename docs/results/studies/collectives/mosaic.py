@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from statistics import fmean, variance
 
 from studies.collectives.l2d2c import BLOCKS
-from studies.raw import Raw, groups, mean_of, numbers_in, read, table
+from studies.raw import Raw, groups, mean_of, numbers_in, read, select, table
 
 CURRICULUM, DEPTHS = "ct28_mosaic_skips_d5", range(2, 10)
 """The curriculum of MOSAIC's members, a task each, and the depths of its tasks."""
@@ -42,30 +42,20 @@ SUMS = {"isolated": (9.5, 1.0), "mosaic": (25.7, 0.8), "mosaic_no_similarity": (
 NUM_PUBLISHED = 5
 
 
-def _cells() -> dict[tuple[str, ...], Raw]:
-    return groups(read(BLOCKS), "curriculum", "exchange", "num_epochs", "num_members")
-
-
 def blocks(exchange: str, num_epochs: str, num_members: str) -> Raw:
     """Return the blocks of the members of some collectives: one for each seed and member."""
-    return _cells().get((CURRICULUM, exchange, num_epochs, num_members), [])
+    lines = select(read(BLOCKS), curriculum=CURRICULUM, exchange=exchange)
+    return select(lines, num_epochs=num_epochs, num_members=num_members)
 
 
-def depth_of(line: dict[str, str]) -> int:
-    """Return the depth of a block's task."""
-    return 1 + line["task"].count(".")
-
-
-def by_depth(
-    exchange: str, num_members: str, num_epochs: str = "1", column: str = "final_return"
-) -> dict[int, list[float]]:
-    """Return a column of blocks by depth: isolated members' own values, of others means of a seed."""
-    found: dict[int, dict[tuple[str, str], list[float]]] = {}
-    for line in blocks(exchange, num_epochs, num_members):
-        if line[column]:
-            sample = (line["seed"], line["member"] if exchange == "isolated" else "")
-            found.setdefault(depth_of(line), {}).setdefault(sample, []).append(float(line[column]))
-    return {depth: [sum(each) / len(each) for each in found[depth].values()] for depth in sorted(found)}
+def by_depth(exchange: str, num_members: str) -> dict[int, list[float]]:
+    """Return final returns by depth: isolated members' own values, of others means of a seed."""
+    found: dict[int, list[float]] = {}
+    for depth in DEPTHS:
+        lines = [line for line in blocks(exchange, "1", num_members) if 1 + line["task"].count(".") == depth]
+        samples = groups(lines, "seed", "member") if exchange == "isolated" else groups(lines, "seed")
+        found[depth] = [fmean(numbers_in(sample, "final_return")) for sample in samples.values()]
+    return found
 
 
 def sums(exchange: str, num_members: str) -> list[float]:
@@ -82,7 +72,7 @@ def sums(exchange: str, num_members: str) -> list[float]:
 
 
 def sums_table() -> str:
-    """Return the sums of final returns beside the published ones."""
+    """Return the sums of final returns beside the published ones, of all members with Welch's 95 % interval."""
     rows = []
     for number in (HALF, ALL):
         for exchange, name in NAMES.items():
@@ -94,12 +84,10 @@ def sums_table() -> str:
 
 
 def published(exchange: str, found: Sequence[float]) -> tuple[str, str]:
-    """Return a published sum, and the difference of ours from it with Welch's 95 % interval."""
+    """Return a published sum, and the difference of ours from it with its interval."""
     value, half = SUMS[exchange]
-    stated = f"{value}" if half is None else f"{value} \u00b1 {half}"
-    if len(found) < 2:
-        return stated, f"{fmean(found) - value:+.1f}"
     low, high = welch(found, value, half)
+    stated = f"{value}" if half is None else f"{value} \u00b1 {half}"
     return stated, f"{fmean(found) - value:+.1f} [{low:+.1f}, {high:+.1f}]"
 
 
@@ -107,11 +95,10 @@ def verdicts() -> str:
     """Return which intervals of differences from the published sums include 0."""
     lines = []
     for exchange, name in NAMES.items():
-        found, (value, half) = sums(exchange, ALL), SUMS[exchange]
-        if len(found) > 1:
-            low, high = welch(found, value, half)
-            verdict = f"{'includes' if low <= 0 <= high else 'excludes'} 0, and is {high - low:.1f} wide"
-            lines.append(f"- {name}, {len(found)} seeds: the interval of the difference {verdict}.")
+        found = sums(exchange, ALL)
+        low, high = welch(found, *SUMS[exchange])
+        verdict = f"{'includes' if low <= 0 <= high else 'excludes'} 0, and is {high - low:.1f} wide"
+        lines.append(f"- {name}, {len(found)} seeds: the interval of the difference {verdict}.")
     return "\n".join(lines)
 
 
@@ -124,10 +111,11 @@ def never(exchange: str) -> str:
 
 def most_apart() -> tuple[int, float]:
     """Return the depth at which MOSAIC's sum of returns differs most from the published one, and by how much."""
-    members = {task: depth_of({"task": task}) for (task,) in groups(blocks("mosaic", "1", ALL), "task")}
+    tasks = {line["task"] for line in blocks("mosaic", "1", ALL)}
     apart = {}
-    for depth, values in by_depth("mosaic", ALL).items():
-        apart[depth] = [*members.values()].count(depth) * (fmean(values) - SHARED[depth - 2])
+    for (depth, values), stated in zip(by_depth("mosaic", ALL).items(), SHARED, strict=True):
+        count = sum(1 + task.count(".") == depth for task in tasks)
+        apart[depth] = count * (fmean(values) - stated)
     return max(apart.items(), key=lambda each: abs(each[1]))
 
 
@@ -150,16 +138,12 @@ def returns_table() -> str:
     rows = []
     returns = [by_depth(exchange, number) for _, exchange, number, _ in COLUMNS]
     for place, depth in enumerate(DEPTHS):
-        stated = [f"{values[place]:.2f}; " if values else "" for *_, values in COLUMNS]
-        cells = [mean_of(each[depth], (0, 1)) if depth in each else "-" for each in returns]
-        rows.append([str(depth), *(there + cell for there, cell in zip(stated, cells, strict=True))])
+        row = [str(depth)]
+        for of_depth, (*_, stated) in zip(returns, COLUMNS, strict=True):
+            values = of_depth[depth]
+            row.append((f"{stated[place]:.2f}; " if stated else "") + (mean_of(values, (0, 1)) if values else "-"))
+        rows.append(row)
     return table(["depth", *(name for name, *_ in COLUMNS)], rows)
-
-
-def settled(num_epochs: str) -> tuple[float, int]:
-    """Return the mean share of batches below 0.9 of isolated members that once had more, and their number."""
-    shares = [each for values in by_depth("isolated", HALF, num_epochs, "share_below").values() for each in values]
-    return sum(shares) / len(shares), len(shares)
 
 
 def texts() -> dict[str, str]:
@@ -174,6 +158,6 @@ def texts() -> dict[str, str]:
     depth, apart = most_apart()
     found |= {"apart_depth": str(depth), "apart": f"{apart:+.1f}"}
     for epochs in ("1", "8"):
-        share, count = settled(epochs)
-        found |= {f"below_{epochs}": f"{share:.2f}", f"below_n_{epochs}": str(count)}
+        shares = [float(line["share_below"]) for line in blocks("isolated", epochs, HALF) if line["share_below"]]
+        found |= {f"below_{epochs}": f"{fmean(shares):.2f}", f"below_n_{epochs}": str(len(shares))}
     return found
