@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -55,9 +55,14 @@ def write_changed(tables: Sequence[Table], change: Callable[[Lines, Table], None
     for table in tables:
         change(lines[table.name], table)
     for name, of in lines.items():
-        path = folder / f"{name}.csv"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open(path, "w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, list(of[0]))
-            writer.writeheader()
-            writer.writerows(of)
+        write(name, of, folder)
+
+
+def write(name: str, lines: Sequence[Mapping[str, object]], folder: Path) -> None:
+    """Write raw results."""
+    path = folder / f"{name}.csv"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(lines[0]))
+        writer.writeheader()
+        writer.writerows(lines)

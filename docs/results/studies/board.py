@@ -2,38 +2,43 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
-from string import Template
 
 from ctgraph_rl.board.standings.board_formats import columns
 from ctgraph_rl.board.standings.board_page import write_board
 from ctgraph_rl.board.standings.board_tables import BoardTable
 from ctgraph_rl.board.standings.track_ceilings import Ceilings
 from ctgraph_rl.board.tracks import tracks
-from studies.raw import HERE, TEMPLATES, table
+from ctgraph_rl.draw.style import new_figure, save_figure
+from studies.raw import HERE, fill, table
 from studies.verdicts import undecided
-
-FOLDER = HERE / "board"
-
 
 ELSEWHERE = ("average performance", "bytes of the agent", "steps", "n", "hours", "level")
 """Columns that only the board itself has: the page names seeds and levels once."""
 
 
-def page(tables: list[BoardTable]) -> str:
-    """Return the page: its template with its tables."""
-    several = [each for each in tables if len(each.standings) > 1]
-    alone = [each for each in tables if len(each.standings) == 1]
-    template = Template((TEMPLATES / "board.md").read_text(encoding="utf-8"))
-    return template.substitute(
-        tables="\n\n".join(f"## {each.title}\n\n{_table(each)}" for each in several),
-        alone=table(
-            ["track and rung", "given", "method", "score", "bytes per task", "landmarks"], list(map(_line, alone))
-        ),
-        count=sum(len(each.standings) for each in tables),
-        without=_without({each.track.name for each in tables}),
-        clearest=_clearest(tables[0]),
-    )
+@cache
+def written() -> list[BoardTable]:
+    """Write the files of the board; return its tables."""
+    return write_board([HERE / "board"], HERE / "board").tables
+
+
+def page(tables: list[BoardTable] | None = None) -> str:
+    """Return the page of some tables, by default those of the submissions."""
+    tables = tables or written()
+    several = [f"## {each.title}\n\n{_table(each)}" for each in tables if len(each.standings) > 1]
+    alone = [_line(each) for each in tables if len(each.standings) == 1]
+    there = {each.track.name for each in tables}
+    lacking = [f"`{each.name}`" for each in tracks() if each.name not in there]
+    texts = {
+        "tables": "\n\n".join(several),
+        "alone": table(["track and rung", "given", "method", "score", "bytes per task", "landmarks"], alone),
+        "count": sum(len(each.standings) for each in tables),
+        "without": f" No line yet: {', '.join(lacking)}." if lacking else "",
+        "clearest": _clearest(tables[0]),
+    }
+    return fill("board", texts)
 
 
 def _clearest(of: BoardTable) -> str:
@@ -42,12 +47,6 @@ def _clearest(of: BoardTable) -> str:
     found = {pair: each for pair, each in of.pairs.items() if names.issuperset(pair)}
     one, other = min(found, key=lambda pair: found[pair].p_value or 0)
     return f"{one} less {other}, {undecided(found[one, other])}"
-
-
-def _without(there: set[str]) -> str:
-    """Return a sentence about the tracks that have no line; nothing where each has one."""
-    lacking = [f"`{each.name}`" for each in tracks() if each.name not in there]
-    return f" No line yet: {', '.join(lacking)}." if lacking else ""
 
 
 def _table(of: BoardTable) -> str:
@@ -80,33 +79,22 @@ def _landmarks(of: Ceilings) -> str:
     return ", ".join(parts)
 
 
-def draw(of: BoardTable, path: Path) -> None:
-    """Draw every seed, the mean and its interval of each submission of a table, beside the bytes for a further task."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
+def draw(folder: Path) -> None:
+    """Draw every seed, the mean and its interval of each submission of the first table, beside its bytes."""
+    of = written()[0]
     lines = list(reversed(of.standings))
-    figure, axes = pyplot.subplots(figsize=(7.2, 0.32 * len(lines) + 0.9))
-    for place, line in enumerate(lines):
+    figure = new_figure(7.2, 0.32 * len(lines) + 0.9)
+    axes = figure.subplots()
+    for row, line in enumerate(lines):
         score = line.score
-        axes.plot(line.entry.scores, [place] * len(line.entry.scores), "|", color="0.6", markersize=9)
-        axes.plot([score.low, score.high], [place, place], color="tab:blue", linewidth=2)
-        axes.plot(score.value, place, "o", color="tab:blue", markersize=5)
+        axes.plot(line.entry.scores, [row] * len(line.entry.scores), "|", color="0.6", markersize=9)
+        axes.plot([score.low, score.high], [row, row], color="tab:blue", linewidth=2)
+        axes.plot(score.value, row, "o", color="tab:blue", markersize=5)
         size = line.entry.method["bytes_per_task"]
-        axes.annotate(f"{size:,} bytes", (1.03, place), va="center", fontsize=8, annotation_clip=False)
+        axes.annotate(f"{size:,} bytes", (1.03, row), va="center", fontsize=8, annotation_clip=False)
     axes.set_yticks(range(len(lines)), [f"{line.name}  ({line.rank})" for line in lines], fontsize=8)
     axes.set_xlim(0, 1.01)
     axes.set_xlabel("normalised performance: mean and 95 % interval, and every seed", fontsize=8)
     axes.set_title(f"{of.title} (rank); at the right: kept for a further task", fontsize=9)
     axes.grid(axis="x", alpha=0.3)
-    figure.tight_layout()
-    figure.savefig(path, dpi=150)
-
-
-def make() -> None:
-    """Write the page, its figure and the files of the board."""
-    made = write_board([FOLDER], FOLDER)
-    (HERE / "board.md").write_text(page(made.tables), encoding="utf-8")
-    draw(made.tables[0], HERE / "board.png")
+    save_figure(figure, folder / "board.png")

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 from statistics import fmean
-from string import Template
 
-from studies.raw import HERE, TEMPLATES, Raw, groups, machines, mean_of, read, table
+from ctgraph_rl.draw.style import new_figure, save_figure
+from studies.raw import Raw, fill, groups, machines, mean_of, read, table
 from studies.verdicts import Effect
 
 NAME = "streams"
-PAGE = HERE / "streams.md"
-PICTURE = HERE / "streams.png"
 
 AGENTS = {"ppo": "PPO", "lstm_ppo": "LSTM-PPO", "dqn": "DQN"}
 METHODS = {"finetune": "fine-tuned", "ewc": "EWC", "mask_ri": "Mask RI", "scratch": "new weights for each task"}
@@ -98,10 +96,8 @@ def _claim(sentence: str, values: list[float]) -> list[str]:
     return [sentence, mean_of(values, effect.bounds), str(len(values)), effect.verdict]
 
 
-def draw(path: Path) -> None:
+def draw(folder: Path) -> None:
     """Draw the share of tasks solved by window, a panel for each agent, means over seeds."""
-    from ctgraph_rl.draw.style import new_figure, save_figure
-
     found = runs()
     figure = new_figure(7.2, 2.6)
     panels = figure.subplots(1, len(AGENTS), sharey=True)
@@ -116,25 +112,18 @@ def draw(path: Path) -> None:
     panels[0].set_ylabel("share of tasks solved")
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", ncols=4, fontsize=7)
-    save_figure(figure, path, 220)
+    save_figure(figure, folder / "streams.png", 220)
 
 
 def page() -> str:
-    """Return the page: its template with its tables and numbers."""
+    """Return the page."""
     lines = read(NAME)
     rates = {AGENTS[line["agent"]]: line["learning_rate"] for line in lines}
-    text = (TEMPLATES / "streams.md").read_text(encoding="utf-8")
-    return Template(text).substitute(
-        counts(),
-        table=table_of_runs(),
-        claims=claims(),
-        rates=", ".join(f"{name} {rate}" for name, rate in rates.items()),
-        frames=f"{int(lines[0]['num_frames']):,}",
-        machines=machines(NAME),
-    )
-
-
-def make() -> None:
-    """Write the page and its figure."""
-    draw(PICTURE)
-    PAGE.write_text(page(), encoding="utf-8")
+    texts = {
+        "table": table_of_runs(),
+        "claims": claims(),
+        "rates": ", ".join(f"{name} {rate}" for name, rate in rates.items()),
+        "frames": f"{int(lines[0]['num_frames']):,}",
+        "machines": machines(NAME),
+    }
+    return fill(NAME, counts() | texts)

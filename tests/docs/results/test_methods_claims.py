@@ -158,7 +158,7 @@ def test_a_cell_of_ppo_has_its_mean_at_the_end_and_the_p_value_of_its_difference
     p_values = dict(zip(found, statistics.holm([each.p_value for each in found.values()]), strict=True))
     table = PAGE.read_text(encoding="utf-8").split("| `fo_b1_4tasks` | `fo_b1_4images` | `fo_b1_depth2to5` |")[1]
 
-    for method in by_agencomparison.METHODS:
+    for method in comparison.METHODS:
         cells = table.split(f"| `{method}` | ")[1].split("\n")[0].strip("| ").split(" | ")
         for cell, axis in zip(cells, ("4tasks", "4images", "depth2to5"), strict=True):
             runs = by_agent.runs(axis, method, "ppo")

@@ -5,8 +5,12 @@ from __future__ import annotations
 import random
 
 import pytest
+from helpers.opposite import write
+from helpers.paths import CHECKOUT
 from studies import raw
 from studies.plasticity import page
+
+PAGE = CHECKOUT / "docs" / "results" / "plasticity.md"
 
 
 def lines_of(condition: str, areas: list[float], rank: list[float] | None = None) -> list[dict[str, object]]:
@@ -24,11 +28,11 @@ def lines_of(condition: str, areas: list[float], rank: list[float] | None = None
 def results(tmp_path, monkeypatch):
     """Replaces the raw results of runs."""
     monkeypatch.setattr(raw, "HERE", tmp_path)
-    return lambda *parts: raw.write(page.NAME, [line for part in parts for line in part])
+    return lambda *parts: write(page.NAME, [line for part in parts for line in part], tmp_path)
 
 
 def test_the_page_is_made_from_the_raw_results():
-    assert page.page() == page.PAGE.read_text(encoding="utf-8")
+    assert page.page() == PAGE.read_text(encoding="utf-8")
 
 
 def test_a_method_is_better_only_after_the_correction_for_nine(results):
@@ -87,7 +91,7 @@ def test_a_cost_is_of_seeds_that_were_distilled_and_the_others_are_counted(resul
         for network, area in (("fresh", 0.8), ("distilled", 0.7), ("old", 0.4)):
             line = {"curriculum": page.CONFLICT, "network": network, "seed": seed, "blocks_before": 1}
             lines.append(line | {"area": 0.0 if seed == 5 else area, "met": seed < 5 or network != "distilled"})
-    raw.write(page.MATCHED, lines)
+    write(page.MATCHED, lines, raw.HERE)
 
     costs = "the start 0.10 (cannot be said), the old weights 0.30 (cannot be said)"
     assert page.matched_words() == f"{costs}; seeds that were not distilled: 1"

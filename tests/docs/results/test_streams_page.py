@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import pytest
+from helpers.paths import CHECKOUT
 
 import curricula
+
+PAGE = CHECKOUT / "docs" / "results" / "streams.md"
 
 
 @pytest.fixture(scope="module")
@@ -15,7 +18,7 @@ def streams():
 
 
 def test_the_page_is_what_its_raw_results_make(streams):
-    assert streams.page() == streams.PAGE.read_text(encoding="utf-8")
+    assert streams.page() == PAGE.read_text(encoding="utf-8")
 
 
 def test_the_runs_are_of_the_named_stream_with_shorter_blocks_and_share_their_lives(streams):

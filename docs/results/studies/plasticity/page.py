@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from statistics import fmean
-from string import Template
 
 import numpy as np
 from scipy.stats import rankdata
 
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.statistics import LEAST_FOR_BOOTSTRAP, Comparison
-from studies.raw import HERE, TEMPLATES, Raw, groups, mean_of, read, shown, table
+from studies.raw import Raw, fill, groups, mean_of, read, select, shown, table
 from studies.verdicts import UNKNOWN
 
 NAME = "plasticity"
 MATCHED = "plasticity_matched"
 TRIALS = "plasticity_trials"
-PAGE = HERE / "plasticity.md"
 
 AREAS = (0.0, 1.0)
 ALPHA = 0.05
@@ -54,10 +52,7 @@ RESAMPLES = 4000
 
 def later_blocks(curriculum: str, condition: str) -> dict[str, Raw]:
     """Return the lines of all blocks but the first, by seed."""
-    lines = []
-    for line in read(NAME):
-        if (line["curriculum"], line["condition"]) == (curriculum, condition) and int(line["block"]) > 1:
-            lines.append(line)
+    lines = [line for line in select(read(NAME), curriculum=curriculum, condition=condition) if line["block"] != "1"]
     return {seed: of_seed for (seed,), of_seed in groups(lines, "seed").items()}
 
 
@@ -116,21 +111,17 @@ def better(curriculum: str, other: str = "none") -> str:
 def matched_words() -> str:
     """Return what the start costs, and what the old weights cost, with the seeds that were not distilled."""
     lines = read(MATCHED)
-    costs = []
-    for name, each in _costs(lines).items():
-        decided = each.p_value is not None and each.p_value <= ALPHA
-        costs.append(f"{name} {shown(each.difference)}{'' if decided else f' ({UNKNOWN})'}")
-    misses = len({line["seed"] for line in lines}) - len(_areas(lines)["distilled"])
-    return f"{', '.join(costs)}; seeds that were not distilled: {misses}"
-
-
-def _costs(lines: Raw) -> dict[str, Comparison]:
-    """Compare a fresh network with a distilled one, which shows the start, and that with the old one: the weights."""
     of = _areas(lines)
-    return {
+    compared_costs = {
         "the start": statistics.compare(of["fresh"], of["distilled"]),
         "the old weights": statistics.compare(of["distilled"], of["old"]),
     }
+    costs = []
+    for name, each in compared_costs.items():
+        decided = each.p_value is not None and each.p_value <= ALPHA
+        costs.append(f"{name} {shown(each.difference)}{'' if decided else f' ({UNKNOWN})'}")
+    misses = len({line["seed"] for line in lines}) - len(of["distilled"])
+    return f"{', '.join(costs)}; seeds that were not distilled: {misses}"
 
 
 def _areas(lines: Raw) -> dict[str, list[float]]:
@@ -209,25 +200,20 @@ def seconds() -> float:
 
 
 def page() -> str:
-    """Return the page: its template with its tables and numbers."""
-    text = (TEMPLATES / "plasticity.md").read_text(encoding="utf-8")
-    return Template(text).substitute(
-        better_conflict=better(CONFLICT),
-        better_stream=better(STREAM),
-        than_adam=better(CONFLICT, "fresh_optimiser"),
-        adam=shown(compared(CONFLICT, "fresh_optimiser", "none").difference),
-        conditions=conditions_table(),
-        conflict_seeds=str(len(later_blocks(CONFLICT, "none"))),
-        stream_seeds=str(len(later_blocks(STREAM, "none"))),
-        loss_conflict=shown(compared(CONFLICT, "none", "fresh").difference),
-        loss_stream=shown(compared(STREAM, "none", "fresh").difference),
-        matched=matched_words(),
-        forecast_conflict=forecast_words(CONFLICT),
-        forecast_stream=forecast_words(STREAM),
-        minutes=f"{seconds():.0f}",
-    )
-
-
-def make() -> None:
-    """Write the page."""
-    PAGE.write_text(page(), encoding="utf-8")
+    """Return the page."""
+    texts = {
+        "better_conflict": better(CONFLICT),
+        "better_stream": better(STREAM),
+        "than_adam": better(CONFLICT, "fresh_optimiser"),
+        "adam": shown(compared(CONFLICT, "fresh_optimiser", "none").difference),
+        "conditions": conditions_table(),
+        "conflict_seeds": len(later_blocks(CONFLICT, "none")),
+        "stream_seeds": len(later_blocks(STREAM, "none")),
+        "loss_conflict": shown(compared(CONFLICT, "none", "fresh").difference),
+        "loss_stream": shown(compared(STREAM, "none", "fresh").difference),
+        "matched": matched_words(),
+        "forecast_conflict": forecast_words(CONFLICT),
+        "forecast_stream": forecast_words(STREAM),
+        "minutes": f"{seconds():.0f}",
+    }
+    return fill(NAME, texts)
