@@ -28,7 +28,8 @@ def test_every_cell_of_the_published_comparison_has_one_curriculum_and_all_evalu
     cells = comparison.groups(comparison.read(name), "method", "seed")
 
     methods = {"finetune", "ewc_published", "mask_lc", "mask_blc", "mask_ri", comparison.EXPERT}
-    assert set(cells) == {(method, seed) for method in methods for seed in map(str, range(20 if name == "masks_ct8_md" else 10))}
+    seeds = range(20 if name == "masks_ct8_md" else 10)
+    assert set(cells) == {(method, str(seed)) for method in methods for seed in seeds}
     assert len({line["fingerprint"] for cell in cells.values() for line in cell}) == 1
     for (method, _), cell in cells.items():
         blocks = 1 if method == comparison.EXPERT else num_tasks
