@@ -1,1 +1,4 @@
-"""What memory cells solve on confounding graphs: the page memory.md."""
+"""What memory cells solve on confounding graphs: the page memory.md.
+
+`conditions` says what was run; all others make the page.
+"""
