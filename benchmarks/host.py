@@ -8,6 +8,7 @@ seed of the main job (4 x 204,800 frames) needs it, and seconds of all seeds. Ti
 from __future__ import annotations
 
 import argparse
+import gc
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
@@ -24,8 +25,8 @@ from tensordict import TensorDictBase
 
 from baselines.parts.networks import Items
 from baselines.update.captured import CapturedGroup
-from baselines.update.stack import Stack
 from ctgraph_rl.checks import at_least_one, require
+from ctgraph_rl.cli import FULL_COLLECTIONS
 from ctgraph_rl.learn import loop
 from ctgraph_rl.log.escape import markdown_table
 from ctgraph_rl.runs import config, job, session
@@ -36,7 +37,6 @@ SMALL = ("agent.num_envs=32", "curriculum.num_frames=1024", "together=true", "ch
 PARTS: dict[str, tuple[list[tuple[Any, str]], int, int]] = {
     "build": ([(job, "build"), (job, "prepare")], 1, 1),
     "begin": ([(session.RunMember, "begin")], 1, 1),
-    "weights to the agents": ([(Stack, "write")], 5, 5),
     "log": ([(loop, "log_training")], 4, 100),
     "evaluate": ([(loop.Lockstep, "_evaluate")], 5, 5),
     "checkpoint": ([(session, "offer_all")], 4, 4),
@@ -136,6 +136,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=128, help="seeds of the group; default: 128")
     arguments = parser.parse_args()
     require(*at_least_one(seeds=arguments.seeds))
+    gc.freeze()  # as the command does
+    young, middle, _ = gc.get_threshold()
+    gc.set_threshold(young, middle, FULL_COLLECTIONS)
     print(table(run(arguments.seeds), arguments.seeds))
 
 

@@ -17,7 +17,7 @@ from typing_extensions import override
 
 from baselines.methods.method import Method
 from baselines.parts.learner import Learner
-from baselines.parts.networks import Data, Items, TensorsByName
+from baselines.parts.networks import Data, Items, TensorsByName, is_greedy, most_likely
 from baselines.parts.policy_gradient import PolicyGradient, Seeds
 from baselines.update.measured import finite_means, table_of
 from baselines.update.seeds import SeedGroup, has_stackable, learner_of, or_error, sampled, why_not_step, write_rows
@@ -190,6 +190,14 @@ class CapturedGroup(SeedGroup):
         if PREVIOUS_ACTION in keys:
             written["next", PREVIOUS_ACTION] = written["action"]
         return written
+
+    def action_probs(self, data: Items) -> tuple[Tensor, Items]:
+        """Return action probabilities of all rows and the next state, as `ctgraph_rl.agent.Agent`."""
+        device = self.draws.tick.device
+        inputs = {key: self.by_seed(data[key].to(device)) for key in self.first.trunk.in_keys}
+        written = {key: value.flatten(0, 1) for key, value in self.stack.one_step(inputs).items()}
+        chances = written.pop("log_probs").softmax(dim=-1)
+        return most_likely(chances) if is_greedy() else chances, written
 
     @override
     def learn(self, batch: TensorDictBase) -> list[Learnt]:

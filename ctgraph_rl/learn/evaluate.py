@@ -21,7 +21,7 @@ from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.collect import ENDS, InitialState, Policy, Step, act, acted, agent_specs, make_env, make_start
-from ctgraph_rl.learn.exact import exact_measures, shown_id
+from ctgraph_rl.learn.exact import ShownTask, measures_by_seed, shown_id
 from ctgraph_rl.learn.labels import task_labels
 from ctgraph_rl.learn.logits_policy import as_policy
 from ctgraph_rl.log.run_log import RunLog
@@ -31,7 +31,6 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.task_like import TaskLike, close_env, require_tasks
 from ctgraph_rl.tasks.protocol import Evaluation
 from ctgraph_rl.tasks.task import Task
-from ctgraph_rl.tasks.values import Measures
 
 
 @torch.no_grad()
@@ -233,7 +232,7 @@ class Evaluator:
         tasks = self.tasks_at(frames)
         policies = task_policies(agent, self.curriculum, self.log, tasks, frames)
         if self.curriculum.evaluation.exact:
-            self._measure(policies, frames, moment, agent.initial_state)
+            measure([self], policies, frames, moment, agent.initial_state)
             return
         policy = _join_policies(agent, policies)
         acts = policy.__call__ if isinstance(policy, nn.Module) else policy  # reads TensorDicts whatever it is
@@ -247,7 +246,7 @@ class Evaluator:
             return
         how = curriculum.evaluation
         if how.exact:
-            self._measure([policy] * len(tasks), frames, moment, initial_state)
+            measure([self], [policy] * len(tasks), frames, moment, initial_state)
             return
         result = evaluate(
             policy,
@@ -267,29 +266,6 @@ class Evaluator:
         """Rows that play a task."""
         how = self.curriculum.evaluation
         return how.num_episodes // how.episodes_per_row
-
-    def _measure(
-        self, policies: Sequence[Policy], frames: int, moment: str, initial_state: InitialState | None
-    ) -> None:
-        curriculum = self.curriculum
-        shape = agent_specs(curriculum).observation["observation"].shape
-
-        def measure(policy: Policy, task: TaskLike) -> Measures:
-            return exact_measures(
-                policy,
-                task,
-                greedy=curriculum.evaluation.greedy,
-                initial_state=initial_state,
-                task_id=shown_id(curriculum, task),
-                shape=shape,
-            )
-
-        for (task, named), policy in zip(self.tasks_at(frames).items(), policies, strict=True):
-            untrained = {}
-            if self.untrained is not None and named[0] == curriculum.block_at(frames) + 1 > 1:  # the next, a new one
-                untrained["untrained_return"] = measure(self.untrained, task).return_mean
-            append = self._append(named, frames, moment)
-            append("evaluation", episodes=None, **vars(measure(policy, task)), exact=True, **untrained)
 
     def _append(self, named: tuple[int, str], frames: int, moment: str) -> Callable[..., None]:
         number, label = named
@@ -329,6 +305,39 @@ def log_evaluation(evaluators: Sequence[Evaluator], result: TensorDictBase, fram
             append("evaluation", **next(measured))
             for step in adaptation(next(of_task), task) if how.adapt_episodes else ():
                 append("adaptation", **step)
+
+
+def measure(
+    evaluators: Sequence[Evaluator],
+    policies: Sequence[Any],
+    frames: int,
+    moment: str,
+    initial_state: InitialState | None,
+    failed: Collection[int] = (),
+) -> None:
+    """Append the lines of an exact evaluation of members.
+
+    Args:
+        policies: for each task; have ``action_probs`` of as many adjacent rows of each member.
+        failed: positions of those that get no line.
+    """
+    first = evaluators[0]
+    curriculum = first.curriculum
+    shape = agent_specs(curriculum).observation["observation"].shape
+    measures = partial(measures_by_seed, greedy=curriculum.evaluation.greedy, initial_state=initial_state)
+    for (task, named), policy in zip(first.tasks_at(frames).items(), policies, strict=True):
+        shown = ShownTask(task, shape, shown_id(curriculum, task))  # type: ignore[arg-type]
+        is_next = named[0] == curriculum.block_at(frames) + 1 > 1
+        for number, found in enumerate(measures(policy, len(evaluators), shown)):
+            if number in failed:
+                continue
+            evaluator = evaluators[number]
+            untrained = {}
+            if evaluator.untrained is not None and is_next:
+                [before] = measures(evaluator.untrained, 1, shown)
+                untrained["untrained_return"] = before.return_mean
+            append = evaluator._append(named, frames, moment)
+            append("evaluation", episodes=None, **vars(found), exact=True, **untrained)
 
 
 ROWS_AT_ONCE = 2**18

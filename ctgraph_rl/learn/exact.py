@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
@@ -68,17 +68,30 @@ def exact_measures(
     Raises:
         ValueError: lists the reasons why there are no exact measures.
     """
-    start = {}
-    if initial_state is not None:
-        start = {key: value.cpu() for key, value in initial_state(1).items()}
-    require(*exact_rules(policy, task, start))
-    assert isinstance(task, Task)  # as the rules say
-    shown = ShownTask(task, tuple(task.observation_shape if shape is None else shape), task_id)
+    shown = ShownTask(task, tuple(task.observation_shape if shape is None else shape), task_id)  # type: ignore[arg-type]
+    [measures] = measures_by_seed(policy, 1, shown, greedy=greedy, initial_state=initial_state, gamma=gamma)
+    return measures
+
+
+@torch.no_grad()
+def measures_by_seed(
+    policy: Any,
+    num_seeds: int,
+    shown: ShownTask,
+    *,
+    greedy: bool,
+    initial_state: InitialState | None,
+    gamma: float = 1.0,
+) -> list[Measures]:
+    """Return `exact_measures` of several seeds, whose ``policy`` acts on as many adjacent rows of each."""
+    start = {} if initial_state is None else dict(initial_state(num_seeds).items())
+    require(*exact_rules(policy, shown.task, start))
+    seeds = _Seeds(policy, num_seeds, shown)
     exploration = ExplorationType.DETERMINISTIC if greedy else ExplorationType.RANDOM
     with set_exploration_type(exploration):
         if not start:
-            return policy_measures(task, _table(policy, task, shown), gamma)
-        return _Enumeration(policy, task, shown, gamma).measures(start)
+            return policy_measures(shown.task, _tables(seeds), gamma)
+        return _Enumeration(seeds, gamma).measures(start)
 
 
 def exact_success(policy: ActionProbs | nn.Module, task: Task) -> float:
@@ -230,27 +243,56 @@ class ShownTask:
         return data
 
 
-def _action_probs(policy: Any, data: Step) -> tuple[Tensor, Step]:
-    """Return what a policy says of data, on the CPU; its weights can be elsewhere."""
-    weights = next(policy.parameters(), None) if isinstance(policy, nn.Module) else None
-    device = None if weights is None else weights.device
-    probs, written = policy.action_probs({key: value.to(device) for key, value in data.items()})
-    return probs.cpu(), {key: value.cpu() for key, value in written.items()}
+@dataclass(frozen=True)
+class _Seeds:
+    """Seeds of one configuration that see the same images of a task."""
+
+    policy: Any
+    num_seeds: int
+    shown: ShownTask
+
+    @property
+    def rows_at_once(self) -> int:
+        return max(1, HISTORIES_AT_ONCE // self.num_seeds)
+
+    def action_probs(self, images: Tensor, is_init: bool, state: Step) -> tuple[Tensor, Step]:
+        """Return action probabilities, float64 [seeds, n, A], and what is written, [seeds, n, ...] each.
+
+        Args:
+            images: uint8 [n, *shape].
+            state: recurrent, [seeds, n, ...] each.
+        """
+        data = self.shown.data(images.expand(self.num_seeds, *images.shape).flatten(0, 1), is_init)
+        data |= {key: value.flatten(0, 1) for key, value in state.items()}
+        weights = next(self.policy.parameters(), None) if isinstance(self.policy, nn.Module) else None
+        device = None if weights is None else weights.device
+        probs, written = self.policy.action_probs({key: value.to(device) for key, value in data.items()})
+        return self.by_seed(probs).double(), {key: self.by_seed(value) for key, value in written.items()}
+
+    def by_seed(self, value: Tensor) -> Tensor:
+        return value.cpu().unflatten(0, (self.num_seeds, -1))
 
 
-def _table(policy: Any, task: Task, shown: ShownTask) -> Tensor:
-    """Return action probabilities, float64 [num_images, A]: means over the views of an id.
+def _tables(seeds: _Seeds) -> Tensor:
+    """Return action probabilities, float64 [seeds, num_images, A]: means over the views of an id.
 
     Those of ids that decide nothing are equal.
     """
+    task = seeds.shown.task
     x = task.observations
     ids = torch.cat([torch.arange(first, last + 1, device="cpu") for first, last in (x.wait_ids, x.decision_ids)])
     views = _num_views(task)
     rows = (ids.unsqueeze(1) * views + torch.arange(views, device="cpu")).flatten()
-    probs, _ = _action_probs(policy, shown.data(shown.bank.index_select(0, rows), False))
-    table = torch.full([task.images.num_images, probs.shape[1]], 1 / probs.shape[1], dtype=torch.float64, device="cpu")
-    table[ids] = probs.double().view(len(ids), views, -1).mean(1)
-    return table
+    bank = seeds.shown.bank
+    found = []
+    for some in rows.split(seeds.rows_at_once):
+        found.append(seeds.action_probs(bank.index_select(0, some), False, {})[0])
+    probs = torch.cat(found, dim=1)
+    num_actions = probs.shape[2]
+    shape = [seeds.num_seeds, task.images.num_images, num_actions]
+    tables = torch.full(shape, 1 / num_actions, dtype=torch.float64, device="cpu")
+    tables[:, ids] = probs.unflatten(1, (len(ids), views)).mean(2)
+    return tables
 
 
 @dataclass
@@ -259,9 +301,9 @@ class _Histories:
 
     Args:
         node: where they are, int64 [n].
-        weight: probabilities, float64 [n].
+        weight: probabilities, float64 [seeds, n].
         discount: gamma to the power of their steps, float64 [n].
-        state: recurrent states.
+        state: recurrent states, [seeds, n, ...] each.
     """
 
     node: Tensor
@@ -270,27 +312,29 @@ class _Histories:
     state: Step
 
     def select(self, rows: Tensor) -> _Histories:
-        state = {key: value.index_select(0, rows) for key, value in self.state.items()}
-        return _Histories(self.node[rows], self.weight[rows], self.discount[rows], state)
+        state = {key: value.index_select(1, rows) for key, value in self.state.items()}
+        return _Histories(self.node[rows], self.weight[:, rows], self.discount[rows], state)
 
 
 class _Enumeration:
-    """All histories of a policy with memory, played depth first in parts of `HISTORIES_AT_ONCE`."""
+    """All histories of policies with memory, played depth first in parts."""
 
-    def __init__(self, policy: Any, task: Task, shown: ShownTask, gamma: float) -> None:
-        self.policy = policy
-        self.task = task
-        self.shown = shown
+    def __init__(self, seeds: _Seeds, gamma: float) -> None:
+        self.seeds = seeds
+        self.task = seeds.shown.task
         self.gamma = gamma
-        self.bank = shown.bank
+        self.bank = seeds.shown.bank
         self.paid = self._paid()
-        self.stays = _longest_stay(task.graph.wait_prob)
-        self.sums = Measures(0.0, 0.0, 0.0, 0.0)
+        self.stays = _longest_stay(self.task.graph.wait_prob)
+        zeros = torch.zeros(seeds.num_seeds, dtype=torch.float64, device="cpu")
+        self.sums = {each.name: zeros.clone() for each in fields(Measures)}
 
-    def measures(self, start: Step) -> Measures:
+    def measures(self, start: Step) -> list[Measures]:
         ones = torch.ones(1, dtype=torch.float64, device="cpu")
-        self._at_home(_Histories(torch.zeros(1, dtype=torch.int64, device="cpu"), ones, ones, start))
-        return self.sums
+        weight = ones.expand(self.seeds.num_seeds, 1)
+        state = {key: self.seeds.by_seed(value) for key, value in start.items()}
+        self._at_home(_Histories(torch.zeros(1, dtype=torch.int64, device="cpu"), weight, ones, state))
+        return [Measures(*values) for values in torch.stack([*self.sums.values()], dim=1).tolist()]
 
     def _paid(self) -> Tensor:
         graph = self.task.graph
@@ -302,20 +346,20 @@ class _Enumeration:
     def _at_home(self, histories: _Histories) -> None:
         seen, probs, written = self._act(histories, StateType.HOME, 0, is_init=True)
         self._count_steps(seen)
-        for action in range(probs.shape[1]) if PREVIOUS_ACTION in seen.state else [-1]:
-            chance = probs[:, action] if action >= 0 else torch.ones_like(seen.weight)
+        for action in range(probs.shape[2]) if PREVIOUS_ACTION in seen.state else [-1]:
+            chance = probs[..., action] if action >= 0 else torch.ones_like(seen.weight)
             self._at_wait(self._after(seen, written, chance, action), 0)
 
     def _at_wait(self, histories: _Histories, level: int) -> None:
-        for part in _parts(histories):
+        for part in self._parts(histories):
             p = self.task.graph.wait_prob
             staying = part
             left = []
             for stay in range(self.stays):
                 seen, probs, written = self._act(staying, StateType.WAIT, level)
                 self._count_steps(seen)
-                self._fail(seen, 1 - probs[:, WAIT_ACTION])
-                waits = probs[:, WAIT_ACTION]
+                waits = probs[..., WAIT_ACTION]
+                self._fail(seen, 1 - waits)
                 left.append(self._after(seen, written, (1 - p) * waits, WAIT_ACTION))
                 if stay + 1 < self.stays:
                     staying = self._after(seen, written, p * waits, WAIT_ACTION)
@@ -328,12 +372,12 @@ class _Enumeration:
     def _at_decision(self, histories: _Histories, level: int) -> None:
         graph = self.task.graph
         b = graph.branching_factor
-        for part in _parts(histories):
+        for part in self._parts(histories):
             seen, probs, written = self._act(part, StateType.DECISION, level)
             self._count_steps(seen)
-            self._fail(seen, 1 - probs[:, 1 : b + 1].sum(1))
+            self._fail(seen, 1 - probs[..., 1 : b + 1].sum(-1))
             for decision in range(1, b + 1):
-                after = self._after(seen, written, probs[:, decision], decision)
+                after = self._after(seen, written, probs[..., decision], decision)
                 branch = torch.full_like(after.node, decision)
                 swap = self.task.swapped_branches
                 if swap is not None and decision in swap[1]:
@@ -345,7 +389,7 @@ class _Enumeration:
     def _act(
         self, histories: _Histories, kind: StateType, level: int, is_init: bool = False
     ) -> tuple[_Histories, Tensor, Step]:
-        """Return the histories split by images, their action probabilities, float64 [n, A], and what was written."""
+        """Return the histories split by images, and what `_Seeds.action_probs` returns."""
         x = self.task.observations
         first, last = x.ids(kind)
         views = _num_views(self.task)
@@ -360,9 +404,7 @@ class _Enumeration:
         rows = torch.arange(count, device="cpu").repeat_interleave(images.shape[1])
         seen = histories.select(rows)
         seen.weight = seen.weight / images.shape[1]
-        data = self.shown.data(self.bank.index_select(0, images.flatten()), is_init)
-        probs, written = _action_probs(self.policy, {**data, **seen.state})
-        return seen, probs.double(), written
+        return seen, *self.seeds.action_probs(self.bank.index_select(0, images.flatten()), is_init, seen.state)
 
     def _after(self, seen: _Histories, written: Step, chance: Tensor, action: int) -> _Histories:
         state = {}
@@ -374,35 +416,36 @@ class _Enumeration:
             state["reward"] = torch.full_like(state["reward"], self.task.step_reward)
         weight = seen.weight * chance
         taken = _Histories(seen.node, weight, seen.discount * self.gamma, state)
-        return taken.select((weight > 0).nonzero().squeeze(1))
+        return taken.select((weight > 0).any(0).nonzero().squeeze(1))
 
     def _count_steps(self, histories: _Histories) -> None:
-        self.sums.length_mean += histories.weight.sum().item()
-        self.sums.return_mean += self.task.step_reward * (histories.weight * histories.discount).sum().item()
+        self._add("length_mean", histories.weight)
+        self._add("return_mean", self.task.step_reward * histories.weight * histories.discount)
 
     def _fail(self, seen: _Histories, chance: Tensor) -> None:
-        self.sums.return_mean += self.task.fail_reward * (seen.weight * seen.discount * chance).sum().item()
+        self._add("return_mean", self.task.fail_reward * seen.weight * seen.discount * chance)
 
     def _arrive(self, histories: _Histories) -> None:
         graph = self.task.graph
         leaf = histories.node - graph.first_node(graph.depth)
         before = histories.discount / self.gamma if self.gamma else torch.zeros_like(histories.discount)
-        self.sums.return_mean += (histories.weight * before * self.paid[leaf]).sum().item()
-        self.sums.success_rate += histories.weight[leaf == self.task.goal_leaf].sum().item()
-        self.sums.end_rate += histories.weight.sum().item()
+        self._add("return_mean", histories.weight * before * self.paid[leaf])
+        self._add("success_rate", histories.weight[:, leaf == self.task.goal_leaf])
+        self._add("end_rate", histories.weight)
         if self.task.extra_end_step:
             self._count_steps(histories)
 
+    def _add(self, name: str, values: Tensor) -> None:
+        self.sums[name] += values.sum(1)
 
-def _parts(histories: _Histories) -> Iterator[_Histories]:
-    for rows in torch.arange(len(histories.node), device="cpu").split(HISTORIES_AT_ONCE):
-        if len(rows):
-            yield histories.select(rows)
+    def _parts(self, histories: _Histories) -> Iterator[_Histories]:
+        for rows in torch.arange(len(histories.node), device="cpu").split(self.seeds.rows_at_once):
+            if len(rows):
+                yield histories.select(rows)
 
 
 def _join(parts: Sequence[_Histories]) -> _Histories:
-    state = {key: torch.cat([part.state[key] for part in parts]) for key in parts[0].state}
-    node, weight, discount = (
-        torch.cat([getattr(part, name) for part in parts]) for name in ("node", "weight", "discount")
-    )
-    return _Histories(node, weight, discount, state)
+    state = {key: torch.cat([part.state[key] for part in parts], dim=1) for key in parts[0].state}
+    node = torch.cat([part.node for part in parts])
+    weight = torch.cat([part.weight for part in parts], dim=1)
+    return _Histories(node, weight, torch.cat([part.discount for part in parts]), state)

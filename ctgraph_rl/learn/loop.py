@@ -20,7 +20,7 @@ from torchrl.envs import EnvBase
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues
 from ctgraph_rl.learn.collect import Policy, make_env, without_ends
-from ctgraph_rl.learn.evaluate import Evaluator, evaluate_together
+from ctgraph_rl.learn.evaluate import Evaluator, evaluate_together, measure
 from ctgraph_rl.learn.refusals import (
     check_adaptation,
     check_env,
@@ -117,7 +117,10 @@ class Group(Protocol):
 
     @property
     def greedy_policy(self) -> Policy | None:
-        """Writes the most likely actions of as many adjacent rows of each agent; None: agents are evaluated in turn."""
+        """Writes the most likely actions of as many adjacent rows of each agent; None: agents are evaluated in turn.
+
+        A group that has it also has ``action_probs``, see `ctgraph_rl.agent.Agent`.
+        """
         ...
 
     def start_task(self, task: int | None = None) -> None:
@@ -425,7 +428,10 @@ def evaluate_members(
     left = [number for number in range(len(evaluators)) if number not in failed]
     agents = group.agents
     draws_on_device = group.device_generators is not None and not how.greedy
-    if group.generators is None or how.exact or draws_on_device:
+    if how.exact and group.greedy_policy is not None:
+        policies = [group] * len(evaluators[0].tasks_at(frames))
+        measure(evaluators, policies, frames, moment, agents[0].initial_state, failed)
+    elif group.generators is None or how.exact or draws_on_device:
         for number in left:
             evaluators[number].evaluate_if_due(agents[number], frames)
     elif how.greedy and group.greedy_policy is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import torch
@@ -122,6 +122,7 @@ def protocol_curves(log: RunLog, curriculum: Curriculum) -> Curves:
     return log.curves(curriculum.trained)
 
 
+@lru_cache(maxsize=1)  # seeds of a group have one curriculum
 def _facts(curriculum: Curriculum) -> NamedValues:
     tasks = curriculum.tasks
     known = {

@@ -64,7 +64,7 @@ def lost_by_policies(task: Task, num_frames: int) -> dict[str, Lost]:
     """
     b = task.graph.branching_factor
     uniform = torch.full([task.images.num_images, b + 1], 1 / (b + 1), dtype=torch.float64, device="cpu")
-    chance = policy_measures(task, uniform)
+    [chance] = policy_measures(task, uniform.unsqueeze(0))
     best = optimal_value(task, 1.0)
     gain = optimal_gain(task)
 

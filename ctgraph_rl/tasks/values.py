@@ -54,13 +54,13 @@ def optimal_value(task: Task, gamma: float) -> float:
     """
     require(*fraction(gamma=gamma))
     tree = _GoalAndAnother(task) if is_needle(task) else smallest_tree(task, False)
-    return _value_at_home(tree, BestActions(task, gamma))
+    return _value_at_home(tree, BestActions(task, gamma)).item()
 
 
 def worst_value(task: Task, gamma: float) -> float:
     """The lowest expected discounted return from home; arguments as `optimal_value`."""
     require(*fraction(gamma=gamma))
-    return _value_at_home(smallest_tree(task, is_needle(task)), _WorstActions(task, gamma))
+    return _value_at_home(smallest_tree(task, is_needle(task)), _WorstActions(task, gamma)).item()
 
 
 def policy_value(task: Task, policy: Tensor, gamma: float = 1.0) -> float:
@@ -79,7 +79,7 @@ def policy_value(task: Task, policy: Tensor, gamma: float = 1.0) -> float:
             `MAX_ENUMERATED_STATES` states where all have to be visited.
     """
     require(*fraction(gamma=gamma), *_policy_rules(task, policy))
-    return _value_of_table(task, policy.detach().to("cpu", torch.float64), gamma)
+    return _value_of_table(task, policy.detach().to("cpu", torch.float64), gamma).item()
 
 
 def success_prob(task: Task, policy: Tensor) -> float:
@@ -98,22 +98,24 @@ class Measures:
     length_mean: float
 
 
-def policy_measures(task: Task, policy: Tensor, gamma: float = 1.0) -> Measures:
-    """The exact measures of a memoryless policy; arguments as `policy_value`.
+def policy_measures(task: Task, policies: Tensor, gamma: float = 1.0) -> list[Measures]:
+    """The exact measures of memoryless policies; arguments as `policy_value`.
 
     They are values of other rewards: 1 at the goal; 1 for a failing action; 1 per step.
+
+    Args:
+        policies: action probabilities, float [policies, num_images, A].
     """
-    require(*fraction(gamma=gamma), *_policy_rules(task, policy))
-    probs = policy.detach().to("cpu", torch.float64)
+    rules = [rule for policy in policies for rule in _policy_rules(task, policy)]
+    require(*fraction(gamma=gamma), *rules)
+    probs = policies.detach().to("cpu", torch.float64)
     needle = replace(task, reward_fn=Needle(), goal_reward=1.0, fail_reward=0.0, step_reward=0.0)
     success = _value_of_table(needle, probs, 1.0)
     ends = 1 + _value_of_table(replace(needle, fail_reward=-1.0), probs, 1.0) - success
-    return Measures(
-        return_mean=success if task == needle and gamma == 1 else _value_of_table(task, probs, gamma),
-        success_rate=success,
-        end_rate=max(ends, success),  # but for rounding it is
-        length_mean=_value_of_table(replace(needle, step_reward=1.0), probs, 1.0) - success,
-    )
+    value = success if task == needle and gamma == 1 else _value_of_table(task, probs, gamma)
+    length = _value_of_table(replace(needle, step_reward=1.0), probs, 1.0) - success
+    rows = torch.stack([value, success, ends.maximum(success), length], dim=-1)  # but for rounding, ends are more
+    return [Measures(*row) for row in rows.tolist()]
 
 
 def memoryless_ceiling(task: Task, deterministic: bool = False) -> float:
@@ -244,18 +246,18 @@ def _random_episode_length(task: Task) -> Fraction:
     return 1 + wait * sum(reached) + leaves * (sum(reached[:d]) + task.extra_end_step * reached[d])
 
 
-def _value_of_table(task: Task, policy: Tensor, gamma: float) -> float:
+def _value_of_table(task: Task, policy: Tensor, gamma: float) -> Tensor:
     shared = not (task.observations.unique_waits or task.observations.unique_decisions)
     return _value_at_home(smallest_tree(task, is_needle(task) and shared), _Memoryless(task, gamma, policy))
 
 
-def _value_at_home(tree: _EveryNode | _GoalPath, chooser: BestActions | _Memoryless) -> float:
+def _value_at_home(tree: _EveryNode | _GoalPath, chooser: BestActions | _Memoryless) -> Tensor:
     after_end = chooser.gamma * tree.task.step_reward if tree.task.extra_end_step else 0.0
     values = chooser.at_wait(tree.end_rewards() + after_end, tree.task.graph.depth)
     for level in reversed(range(tree.task.graph.depth)):
         decided = chooser.at_decision(tree.children(values, level), level)
         values = chooser.at_wait(chooser.gamma * decided, level)
-    return tree.task.step_reward + chooser.gamma * values[0].item()
+    return tree.task.step_reward + chooser.gamma * values[..., 0]
 
 
 def smallest_tree(task: Task, collapses: bool) -> _EveryNode | _GoalPath:
@@ -284,8 +286,8 @@ class _EveryNode:
         return task.goal_reward * share.to(torch.float64)
 
     def children(self, values: Tensor, level: int) -> Tensor:
-        """By parent and decision: float64 [b^level, b]."""
-        by_branch = values.view(-1, self.task.graph.branching_factor)
+        """By parent and decision: float64 [..., b^level, b]."""
+        by_branch = values.unflatten(-1, (-1, self.task.graph.branching_factor))
         swap = self.task.swapped_branches
         node = self.task.swapped_node
         if swap is None or node is None or len(swap[0]) != level:
@@ -293,7 +295,7 @@ class _EveryNode:
         by_decision = by_branch.clone()
         first, second = (branch - 1 for branch in swap[1])
         number = node - self.task.graph.first_node(level)
-        by_decision[number, [first, second]] = by_branch[number, [second, first]]
+        by_decision[..., number, [first, second]] = by_branch[..., number, [second, first]]
         return by_decision
 
 
@@ -307,9 +309,9 @@ class _GoalPath:
         return torch.tensor([self.task.goal_reward, 0.0], dtype=torch.float64, device="cpu")
 
     def children(self, values: Tensor, level: int) -> Tensor:
-        """By parent and decision: float64 [2, b]."""
-        children = values[1].repeat(2, self.task.graph.branching_factor)
-        children[0, self.task.goal_decisions[level] - 1] = values[0]
+        """By parent and decision: float64 [..., 2, b]."""
+        children = values[..., 1:, None].expand(*values.shape, self.task.graph.branching_factor).clone()
+        children[..., 0, self.task.goal_decisions[level] - 1] = values[..., 0]
         return children
 
 
@@ -359,14 +361,14 @@ class _WorstActions(BestActions):
 class _Memoryless:
     task: Task
     gamma: float
-    policy: Tensor
+    policy: Tensor  # float64 [..., num_images, A]
 
     def at_wait(self, arrival: Tensor, level: int) -> Tensor:
         """The module's V(wait), solved."""
         probs = self._action_probs(StateType.WAIT, level)
         p = self.task.graph.wait_prob
-        waits = probs[:, WAIT_ACTION]
-        fails = probs[:, 1:].sum(-1)
+        waits = probs[..., WAIT_ACTION]
+        fails = probs[..., 1:].sum(-1)
         leaves = self.task.step_reward + waits * (1 - p) * arrival + fails * self.task.fail_reward
         return leaves / (1 - self.gamma * p * waits)
 
@@ -374,19 +376,19 @@ class _Memoryless:
         """The mean over decisions and failing."""
         probs = self._action_probs(StateType.DECISION, level)
         b = self.task.graph.branching_factor
-        fails = probs[:, WAIT_ACTION] + probs[:, b + 1 :].sum(-1)
-        decided = self.gamma * (probs[:, 1 : b + 1] * children).sum(-1)
+        fails = probs[..., WAIT_ACTION] + probs[..., b + 1 :].sum(-1)
+        decided = self.gamma * (probs[..., 1 : b + 1] * children).sum(-1)
         return self.task.step_reward + decided + fails * self.task.fail_reward
 
     def _action_probs(self, kind: StateType, level: int) -> Tensor:
-        """float64 [b^level, A] by node where ids are unique, else [1, A], the mean over ids."""
+        """float64 [..., b^level, A] by node where ids are unique, else [..., 1, A], the mean over ids."""
         b = self.task.graph.branching_factor
         first, last = self.task.observations.ids(kind)
         if not self.task.observations.is_unique(kind):
-            return self.policy[first : last + 1].mean(0, keepdim=True)
+            return self.policy[..., first : last + 1, :].mean(-2, keepdim=True)
         before = self.task.observations.first_of_level(self.task.graph, kind, level)
         number = before + torch.arange(b**level, device="cpu")
-        return self.policy[first + number % (last - first + 1)]
+        return self.policy[..., first + number % (last - first + 1), :]
 
 
 def is_needle(task: Task) -> bool:

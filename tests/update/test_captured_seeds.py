@@ -19,7 +19,7 @@ from baselines.update.captured import CapturedGroup, Draws
 from baselines.update.update import losses_of, total_loss
 from ctgraph_rl import Block, Evaluation, RunLog
 from ctgraph_rl.core import philox
-from ctgraph_rl.learn import collect
+from ctgraph_rl.learn import collect, exact
 from ctgraph_rl.learn.evaluate import Evaluator
 from ctgraph_rl.learn.loop import evaluate_members
 from ctgraph_rl.learn.stacked import learn_together
@@ -116,14 +116,19 @@ def test_draws_go_on_from_a_saved_state(make):
     assert group.draws.seed.flatten().tolist() == [*THREE_SEEDS]
 
 
-@pytest.mark.parametrize(("name", "num_lengths"), [("ppo", 2), ("lstm_ppo", 1)])
-def test_seeds_are_evaluated_at_once_as_each_alone_and_without_one_that_failed(make, name, num_lengths):
-    group = make(name)
+def spread(group: CapturedGroup) -> None:
+    """Let seeds act in different ways."""
     learn(group)
     with torch.no_grad():
         for parameter in chain(*(agent.parameters() for agent in group.agents)):
-            parameter.mul_(9)  # so that seeds act in different ways
+            parameter.mul_(9)
     group.stack.read()
+
+
+@pytest.mark.parametrize(("name", "num_lengths"), [("ppo", 2), ("lstm_ppo", 1)])
+def test_seeds_are_evaluated_at_once_as_each_alone_and_without_one_that_failed(make, name, num_lengths):
+    group = make(name)
+    spread(group)
     frames = CURRICULUM.num_frames
     curriculum = replace(CURRICULUM, evaluation=Evaluation(6, greedy=True))
     at_once, alone = ([Evaluator(curriculum, seed, RunLog()) for seed in THREE_SEEDS] for _ in range(2))
@@ -135,6 +140,29 @@ def test_seeds_are_evaluated_at_once_as_each_alone_and_without_one_that_failed(m
     found, expected = ([lines(each.log) for each in some] for some in (at_once, alone))
     assert found == [expected[0], [], expected[2]]
     assert len({line["length_mean"] for line in expected[0] + expected[2]}) >= num_lengths
+
+
+@pytest.mark.parametrize("greedy", [False, True])
+@pytest.mark.parametrize("name", ["ppo", "lstm_ppo"])
+def test_exact_measures_of_seeds_at_once_are_those_of_each_alone(make, name, greedy, monkeypatch):
+    group = make(name)
+    spread(group)
+    monkeypatch.setattr(exact, "HISTORIES_AT_ONCE", 6)
+    curriculum = replace(CURRICULUM, evaluation=Evaluation(exact=True, greedy=greedy))
+    at_once, alone = ([Evaluator(curriculum, seed, RunLog()) for seed in THREE_SEEDS] for _ in range(2))
+    frames = CURRICULUM.num_frames
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Evaluator, "evaluate_if_due", None)
+        evaluate_members(at_once, group, frames, "after", failed={1})
+    for evaluator, agent in zip(alone, group.agents, strict=True):
+        evaluator.evaluate_if_due(agent, frames)
+
+    found, expected = ([lines(each.log) for each in some] for some in (at_once, alone))
+    assert [len(each) for each in found] == [2, 0, 2]
+    for line, its in zip(found[0] + found[2], expected[0] + expected[2], strict=True):
+        assert line == pytest.approx(its, abs=1e-5)
+    assert greedy or len({line["length_mean"] for line in expected[0] + expected[2]}) > 1
 
 
 def test_what_changes_an_agent_at_the_start_of_a_task_changes_what_acts(make):
