@@ -26,7 +26,7 @@ from ctgraph_rl import (
     make_agent,
 )
 from ctgraph_rl.learn.collect import PREVIOUS_ACTION
-from ctgraph_rl.learn.exact import count_histories, exact_measures, shown_id
+from ctgraph_rl.learn.exact import ShownTask, count_histories, exact_measures, measures_by_seed, shown_id
 from ctgraph_rl.learn.logits_policy import LogitsPolicy
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_posr_b1, ct_su_b1
 from ctgraph_rl.tasks.values import open_loop_ceiling
@@ -148,6 +148,26 @@ def test_a_fixed_sequence_reaches_the_open_loop_ceiling():
     assert found.success_rate == pytest.approx(open_loop_ceiling(task), abs=1e-11) == 0.5
     right = Count(0, 0, 1, 0, 1, 0)
     assert exact_measures(right, ct_su_b1(), greedy=True, initial_state=start_of_count).success_rate == 1
+
+
+class Apart(Count):
+    """Two agents of which the second decides otherwise."""
+
+    def action_probs(self, data):
+        probs, written = super().action_probs(data)
+        return torch.where(data["seed"] == 1, probs[:, [0, 2, 1]], probs), written
+
+
+def test_seeds_that_decide_otherwise_are_measured_at_once():
+    def start(rows):
+        return start_of_count(rows).set("seed", torch.arange(rows).unsqueeze(1))
+
+    shown = ShownTask(ct_su_b1(goal=(2, 2)), ct_su_b1().observation_shape, None)
+    found = measures_by_seed(Apart(0, 0, 1, 0, 1, 0), 2, shown, greedy=True, initial_state=start)
+
+    assert [asdict(each) for each in found] == [
+        {"return_mean": reward, "success_rate": reward, "end_rate": 1, "length_mean": 6} for reward in (0, 1)
+    ]
 
 
 class Repeat:
