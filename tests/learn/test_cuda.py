@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import pytest
 import torch
@@ -16,7 +17,7 @@ import curricula
 from baselines.update.captured import CapturedGroup
 from benchmarks import environment_ladder as ladder
 from benchmarks.environments import configurations
-from ctgraph_rl import CTGraphEnv, Rows, RunLog, Steps, learn_curriculum, make_agent, rollout
+from ctgraph_rl import CTGraphEnv, Evaluation, Rows, RunLog, Steps, learn_curriculum, make_agent, rollout
 from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.region import WARM_UP, Region
 from ctgraph_rl.learn import collect
@@ -193,3 +194,14 @@ def test_a_run_learns_on_a_gpu():
     log = learn_curriculum(curriculum, agent, device="cuda")
 
     assert log.performance(4).shape == (5, 4)
+
+
+def test_exact_evaluation_and_metrics_of_units_read_an_agent_on_a_gpu():
+    curriculum = curricula.load("su_b1_4tasks", num_frames=64 * 16)
+    curriculum = replace(curriculum, evaluation=Evaluation(exact=True))
+    agent = make_agent("lstm_ppo", curriculum, num_envs=64, num_steps=16).to("cuda")
+
+    log = learn_curriculum(curriculum, agent, device="cuda", log_units=True)
+
+    assert log.performance(4).shape == (5, 4)
+    assert log.of_kind("units")
