@@ -232,7 +232,7 @@ class Evaluator:
         tasks = self.tasks_at(frames)
         policies = task_policies(agent, self.curriculum, self.log, tasks, frames)
         if self.curriculum.evaluation.exact:
-            measure([self], policies, frames, moment, agent.initial_state)
+            measure([self], policies, frames, moment, initial_state=agent.initial_state)
             return
         policy = _join_policies(agent, policies)
         acts = policy.__call__ if isinstance(policy, nn.Module) else policy  # reads TensorDicts whatever it is
@@ -246,7 +246,7 @@ class Evaluator:
             return
         how = curriculum.evaluation
         if how.exact:
-            measure([self], [policy] * len(tasks), frames, moment, initial_state)
+            measure([self], [policy] * len(tasks), frames, moment, initial_state=initial_state)
             return
         result = evaluate(
             policy,
@@ -312,6 +312,7 @@ def measure(
     policies: Sequence[Any],
     frames: int,
     moment: str,
+    *,
     initial_state: InitialState | None,
     failed: Collection[int] = (),
 ) -> None:

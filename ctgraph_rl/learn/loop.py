@@ -430,7 +430,8 @@ def evaluate_members(
     draws_on_device = group.device_generators is not None and not how.greedy
     if how.exact and group.greedy_policy is not None:
         policies = [group] * len(evaluators[0].tasks_at(frames))
-        measure(evaluators, policies, frames, moment, agents[0].initial_state, failed)
+        start = agents[0].initial_state
+        measure(evaluators, policies, frames, moment, initial_state=start, failed=failed)
     elif group.generators is None or how.exact or draws_on_device:
         for number in left:
             evaluators[number].evaluate_if_due(agents[number], frames)
