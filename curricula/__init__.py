@@ -23,14 +23,13 @@ if TYPE_CHECKING:
 _MODULES = ("adaptation", "gym", "lives", "masks", "memory", "paper", "profile", "sharing", "task_free")
 
 _HOMES = {
-    "MISSING": "published",
     "from_axes": "configured",
     "from_graph": "configured",
     "from_meta_json": "meta_json",
     "sequence": "axes",
 }
 
-__all__ = ["MISSING", "from_axes", "from_graph", "from_meta_json", "load", "names", "sequence", "summary"]
+__all__ = ["from_axes", "from_graph", "from_meta_json", "load", "names", "sequence", "summary"]
 
 
 def names() -> list[str]:

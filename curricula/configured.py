@@ -133,9 +133,9 @@ def from_axes(
     )
     task = configured(configuration)
     kind = KINDS[configuration]
-    depths = _several(depth, task.graph.depth)
-    probs = _several(wait_prob, task.graph.wait_prob)
-    seeds = _several(image_seeds)
+    depths = several(depth, task.graph.depth)
+    probs = several(wait_prob, task.graph.wait_prob)
+    seeds = several(image_seeds)
     whole = bool(depths) and are_ints(depths, 1)
     require((whole, f"depth must be an integer >= 1 or a list of them, got {depth!r}"))
     if random_graphs is None:
@@ -145,7 +145,7 @@ def from_axes(
     else:
         drawn = f"random_graphs draws goals and order: leave both out, got goals={goals!r} and order={order!r}"
         require(((goals, order) == ("all", "product"), drawn))
-        factors = _several(branching_factor, task.graph.branching_factor)
+        factors = several(branching_factor, task.graph.branching_factor)
         graphs = axes.random_tasks(random_graphs, seed, factors, depths, probs, kinds=(kind,), image_seeds=seeds)
     ids = {
         "unique_decisions": unique_decisions,
@@ -233,7 +233,7 @@ def from_graph(
     )
     depth = read_task(config, ())["graph"].depth  # type: ignore[arg-type]
     task = Task.from_json(config, (1,) * depth)  # type: ignore[arg-type]
-    probs = _several(wait_prob, task.graph.wait_prob)
+    probs = several(wait_prob, task.graph.wait_prob)
     graphs = axes.wait_probs(axes.random_goals(task, 1, seed) if goals == "nested" else task, probs)
     tasks = _in_order([graphs], goals, num_goals, order, seed=seed)
     return _curriculum(
@@ -247,7 +247,8 @@ def from_graph(
     )
 
 
-def _several(value: object, usual: object = None) -> tuple[Any, ...]:
+def several(value: object, usual: object = None) -> tuple[Any, ...]:
+    """Return one or several values as a tuple; None stands for the usual ones."""
     listed = as_tuple(usual if value is None else value)
     return listed if isinstance(listed, tuple) else (listed,)
 
@@ -268,7 +269,7 @@ def _in_order(by_seed: Sequence[Tasks], goals: Any, num_goals: int, order: str, 
     depths = {graph.graph.depth for graph in by_seed[0]}
     given = goals
     if not isinstance(goals, str) or goals not in GOALS:
-        goals = _several(goals)
+        goals = several(goals)
         read = [read_goal(goal) for goal in goals]
         are_goals = all(isinstance(goal, tuple) for goal in read)
         require((are_goals, f"goals must be one of {', '.join(GOALS)}, or a list such as [1.2,2.1], got {given!r}"))
@@ -313,7 +314,7 @@ def _curriculum(
     )
     changes = None if switch is None else SWITCHES[switch](switch_episodes)
     if goal_change is not None:
-        lasts = _several(goal_change)
+        lasts = several(goal_change)
         pair = lasts * 2 if len(lasts) == 1 else lasts
         in_order = len(pair) == 2 and are_ints(pair, 1) and pair[0] <= pair[1]
         rule = f"goal_change must be a number of episodes >= 1, or the fewest and the most, got {goal_change!r}"

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
-from ctgraph_rl.checks import as_tuple, by_name, require
+from ctgraph_rl.checks import by_name, require
 from ctgraph_rl.core.goal import Goal
 from ctgraph_rl.tasks.curriculum import Curriculum, Stream
 from ctgraph_rl.tasks.life import Life
 from ctgraph_rl.tasks.protocol import Evaluation
 from ctgraph_rl.tasks.task import Task
-from curricula.configured import from_axes
+from curricula.configured import from_axes, several
 
 VERSION = 1
 
@@ -72,8 +71,8 @@ def stream(
     """
     require((goals not in ("random", "nested"), f"goals must be all or a list such as [1.2,2.1], got {goals!r}"))
     choices: list[Task] = []
-    for each in _several(configuration):
-        for pays in _several(reward_fn):
+    for each in several(configuration):
+        for pays in several(reward_fn):
             drawn_from = from_axes(
                 configuration=each,
                 branching_factor=branching_factor,
@@ -87,7 +86,7 @@ def stream(
                 reward_fn=pays,
             )
             choices += drawn_from.examples  # type: ignore[arg-type]
-    sets = () if image_seeds is None else _several(image_seeds)
+    sets = () if image_seeds is None else several(image_seeds)
     blocks = Life(tuple(choices), num_tasks, num_frames, order=order, image_seeds=sets, share=share, lag=lag, seed=seed)
     every = num_frames // EVALUATIONS if num_frames % EVALUATIONS == 0 else 0
     return Stream("stream", VERSION, SOURCE, blocks, Evaluation(every=every, tasks="seen", exact=True))
@@ -108,11 +107,6 @@ def goal_conflict(num_frames: int = 98_304, depth: int = 3, num_tasks: int = 2, 
     every = num_frames // 48 if num_frames % 48 == 0 else 0
     how = Evaluation(greedy=False, every=every, tasks="seen", exact=True)
     return Stream("goal_conflict", 1, CONFLICT, life, how)  # type: ignore[arg-type]
-
-
-def _several(value: object) -> tuple[Any, ...]:
-    listed = as_tuple(value)
-    return listed if isinstance(listed, tuple) else (listed,)
 
 
 NAMED = by_name(goal_conflict, stream)

@@ -13,7 +13,6 @@ from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.tasks.configurations import observations_of
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import PaperImages
-from ctgraph_rl.tasks.observations import Observations
 from ctgraph_rl.tasks.task import Task
 from curricula.axes import sequence
 
@@ -61,25 +60,19 @@ def co_hard(
     graph = CTGraph(2, depth, p)
     observations = replace(observations_of(graph, "confounding", num_wait_images), read_noise=read_noise)
     if unique_decisions:
-        observations = _with_unique_decisions(observations, graph.num_decision_states)
+        more = graph.num_decision_states - 1
+        shown = observations
+        observations = replace(
+            shown,
+            decision_ids=(shown.decision_ids[0], shown.decision_ids[1] + more),
+            wait_ids=(shown.wait_ids[0] + more, shown.wait_ids[1] + more),
+            end_ids=(shown.end_ids[0] + more, shown.end_ids[1] + more),
+            unique_decisions=True,
+            unique_ends=False,
+        )
     goal = tuple(1 + place % 2 for place in range(depth))
     task = Task(graph, goal, observations, PaperImages(observations.last_id + 1, image_seed))
     return sequence("co_hard", [task], num_frames, source=SOURCE)
-
-
-def _with_unique_decisions(observations: Observations, count: int) -> Observations:
-    more = count - 1
-    first, last = observations.decision_ids
-    wait, last_wait = observations.wait_ids
-    end, last_end = observations.end_ids
-    return replace(
-        observations,
-        decision_ids=(first, last + more),
-        wait_ids=(wait + more, last_wait + more),
-        end_ids=(end + more, last_end + more),
-        unique_decisions=True,
-        unique_ends=False,
-    )
 
 
 NAMED = {"co_hard": co_hard}

@@ -17,7 +17,7 @@ from os import PathLike
 from pathlib import Path
 from reprlib import repr as short
 
-from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule, are_ints, is_int, require, takes_numbers
+from ctgraph_rl.checks import ReadOnlyValues, Rule, are_ints, is_int, require, takes_numbers
 from ctgraph_rl.strict import json_object, within
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Protocol
@@ -59,12 +59,17 @@ def from_meta_json(path: str | PathLike[str], num_frames: int | Sequence[int], n
         require(*_key_rules(meta))
         require(*_value_rules(meta))
         paths = [_within(file.parent, config) for config in meta["config_paths"]]
-    environments = [read_environment(path) for path in paths]
+    environments = []
+    for path in paths:
+        content = _read(path)
+        with within(path):
+            environments.append(read_task(content, ()))
     with within(file):
-        pool = Pool([environment["graph"].num_end_states for environment in environments], meta["task_order"])
-        numbers = _chosen(meta, pool.size)
+        sizes = [environment["graph"].num_end_states for environment in environments]
+        numbers = _chosen(meta, sum(sizes))
         tasks = []
-        for config, leaf in map(pool.at, numbers):
+        for number in numbers:
+            config, leaf = place_of(number, sizes, meta["task_order"])
             graph = environments[config]["graph"]
             tasks.append(Task(**environments[config] | {"goal": graph.path(graph.num_decision_states + leaf)}))
         by_place = meta.get("label_by_curriculum_index", meta.get("task_label_mode") == "curriculum_index")
@@ -81,40 +86,26 @@ def from_meta_json(path: str | PathLike[str], num_frames: int | Sequence[int], n
         return sequence(name or file.stem, tasks, num_frames, source=f"meta-JSON file {file.name}", protocol=protocol)
 
 
-class Pool:
-    """All goals of several environments, numbered in one of the orders.
+def place_of(number: int, sizes: Sequence[int], order: str) -> tuple[int, int]:
+    """Return the environment and goal of a number; environments without a further goal lose their turn.
 
     Args:
+        number: among all goals of the environments.
         sizes: number of goals of each environment.
         order: ``default`` or ``interleaved``.
     """
-
-    def __init__(self, sizes: Sequence[int], order: str) -> None:
-        self.size = sum(sizes)
-        self._sizes = tuple(sizes)
-        self._takes_turns = order == "interleaved"
-
-    def at(self, number: int) -> tuple[int, int]:
-        """Return the environment and goal of a number; environments without a further goal lose their turn."""
-        if not self._takes_turns:
-            starts = [0, *accumulate(self._sizes)]
-            config = bisect_right(starts, number) - 1
-            return config, number - starts[config]
-        done = 0
-        for end in sorted(set(self._sizes)):
-            active = [config for config, size in enumerate(self._sizes) if size > done]
-            if number < len(active) * (end - done):
-                break
-            number -= len(active) * (end - done)
-            done = end
-        return active[number % len(active)], done + number // len(active)
-
-
-def read_environment(path: Path) -> NamedValues:
-    """The arguments of `Task`, without goal, for an environment file."""
-    content = _read(path)
-    with within(path):
-        return read_task(content, ())
+    if order != "interleaved":
+        starts = [0, *accumulate(sizes)]
+        config = bisect_right(starts, number) - 1
+        return config, number - starts[config]
+    done = 0
+    for end in sorted(set(sizes)):
+        active = [config for config, size in enumerate(sizes) if size > done]
+        if number < len(active) * (end - done):
+            break
+        number -= len(active) * (end - done)
+        done = end
+    return active[number % len(active)], done + number // len(active)
 
 
 def _read(path: Path) -> ReadOnlyValues:

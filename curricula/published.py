@@ -1,4 +1,4 @@
-"""Common parts of the published sequences: the labs' environments, task ids and evaluation; and those lost.
+"""Common parts of the published sequences: the labs' environments, task ids and evaluation.
 
 The labs write a goal as a string of 0 and 1, and a task with its image seed before it: ``2:110`` is the goal 2.2.1
 with the images of seed 2. Environments are as `Task.from_json` reads their files.
@@ -7,7 +7,7 @@ with the images of seed 2. Environments are as `Task.from_json` reads their file
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 from ctgraph_rl.checks import NamedValues, is_int, require
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -141,69 +141,3 @@ def chosen(what: str, number: int, choices: Sequence[Any]) -> Any:
     """
     require((is_int(number, 0, len(choices) - 1), f"{what} must be in 0..{len(choices) - 1}, got {number!r}"))
     return choices[number]
-
-
-class Missing(NamedTuple):
-    """A published experiment, or part of one, without a curriculum."""
-
-    name: str
-    what: str
-    why: str
-
-
-MISSING = (
-    Missing(
-        "ct29_recovery with unique labels",
-        "AMSC: the two visits to one task have the labels 21 and 28",
-        "here a task has one id; ct29_recovery has the same tasks with the labels of the whole pool",
-    ),
-    Missing(
-        "ct28_blocked, consistent",
-        "CT28 family after family with the consistent fourth family",
-        "no such file was found: every blocked file skips depth 5 (ct28_blocked_skips_d5)",
-    ),
-    Missing(
-        "ct28, other image seeds",
-        "CT28 interleaved with other image seeds than 1 to 4",
-        "no such file was found; blocked files exist for five sets of seeds (argument seed_set)",
-    ),
-    Missing(
-        "ct36",
-        "L2D2-C: 36 tasks on four graphs with branching factor 3, depth 2",
-        "three of its four environment files have image seed 2: 36 ids stand for 18 tasks, and here a task has one id",
-    ),
-    Missing(
-        "the RLlib baselines of L2D2-C",
-        "PPO, DD-PPO and IMPALA: 12 slots of 84,480 steps over 4 goals at p = 0.5",
-        "the environment redrew its goal every 5,000 episodes of a worker, in no fixed relation to the slots",
-    ),
-    Missing(
-        "ct28_md of MOSAIC",
-        "4 agents x 10 depths",
-        "its fourth path, 11011, is not in the pool of its environments; mosaic_ladder has the two ladders to depth 14",
-    ),
-    Missing(
-        "ctwtf_half", "L2D2-C: 14 tasks of two families", "half of its indices are beyond its own pool of 1,016 tasks"
-    ),
-    Missing(
-        "context detection, 2020",
-        "Dick et al., Frontiers in Neurorobotics: a pair of depth-2 graphs that differ in one transition",
-        "no CT-graph configuration was published; dick2020_pair is rebuilt from the words of the paper",
-    ),
-    Missing(
-        "the confounding graphs of MOHQA",
-        "Ladosz et al., TNNLS 2021: p = 0.9, up to 500 wait images",
-        "the published configuration is another, fully observable one; co_hard_4tasks is rebuilt from the numbers",
-    ),
-    Missing(
-        "PEARL on the CT-graph",
-        "a baseline of the neuromodulated meta-learning paper",
-        "its public code has no CT-graph",
-    ),
-    Missing(
-        "the goals of penn_a_swap",
-        "which goals the authors' trials had",
-        "they were drawn again in every generation; penn_a_swap draws by the same rule from another seed",
-    ),
-)
-"""Sequences that cannot be recovered, and why."""

@@ -13,7 +13,7 @@ import curricula
 from ctgraph_rl import CTGraph, Task
 from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from curricula import meta_json
-from curricula.meta_json import MOST_BYTES, Pool
+from curricula.meta_json import MOST_BYTES, place_of
 from curricula.published import environment, one_wait_image
 
 OLD_KEYS = {
@@ -166,8 +166,7 @@ def test_a_number_is_found_without_listing_the_pool(order):
     lists = [[(config, goal) for goal in range(size)] for config, size in enumerate(sizes)]
     in_turns = [part[i] for i in range(8) for part in lists if i < len(part)]
     expected = in_turns if order == "interleaved" else [entry for part in lists for entry in part]
-    pool = Pool(sizes, order)
-    assert [pool.at(number) for number in range(pool.size)] == expected
+    assert [place_of(number, sizes, order) for number in range(sum(sizes))] == expected
 
 
 def test_few_tasks_of_a_pool_beyond_counting_are_read_at_once(tmp_path):

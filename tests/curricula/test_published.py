@@ -6,7 +6,6 @@ from dataclasses import replace
 from itertools import pairwise
 
 import pytest
-from helpers.paths import CHECKOUT
 from helpers.task_families import listing
 
 import curricula
@@ -15,7 +14,7 @@ from ctgraph_rl.tasks.configurations import ct_graph
 from ctgraph_rl.tasks.images import ReferenceImages, ReferenceOneHot
 from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from ctgraph_rl.tasks.switch import Drift
-from curricula.published import MISSING, full_mdp, labelled, one_wait_image, pool_ids, words
+from curricula.published import full_mdp, labelled, one_wait_image, pool_ids, words
 
 EVERY_5120 = Evaluation(num_episodes=10, greedy=True, every=5120)
 
@@ -332,16 +331,6 @@ def test_two_ids_for_one_task_are_refused():
 def test_what_was_not_published_is_refused_with_the_choices(name, arguments, message):
     with pytest.raises(ValueError, match=message):
         curricula.load(name, **arguments)
-
-
-def test_what_is_missing_is_listed_with_reasons_and_not_loaded():
-    assert len(MISSING) == 11
-    assert all(entry.name and entry.what and entry.why for entry in MISSING)
-    assert {entry.name for entry in MISSING}.isdisjoint(curricula.names())
-    assert curricula.MISSING is MISSING
-    page = (CHECKOUT / "docs" / "reference" / "curricula.md").read_text(encoding="utf-8")
-    rows = "".join(f"| **{entry.name}**: {entry.what} | {entry.why} |\n" for entry in MISSING)
-    assert rows in page
 
 
 @pytest.mark.parametrize("name", [name for name in curricula.names() if "ct28" in name])
