@@ -1,5 +1,6 @@
 """README shows only what runs: CI executes its two commands, this test its Python."""
 
+import csv
 import re
 import subprocess
 from pathlib import Path
@@ -9,7 +10,9 @@ import pytest
 from helpers.paths import CHECKOUT
 
 import curricula
+from baselines.methods.finetune import Finetune
 from ctgraph_rl import metrics
+from ctgraph_rl.runs.job import curriculum_of
 
 README = CHECKOUT / "README.md"
 
@@ -65,14 +68,38 @@ def test_the_page_on_how_numbers_were_made_has_the_file_of_each_result_of_readme
 
     text = " ".join(README.read_text(encoding="utf-8").replace("**", "").split())
     results = text.split("## Results")[1].split("## More")[0]
-    for file, _, commit, numbers in rows:
+    for *_, commit, numbers in rows:
         assert re.fullmatch(r"[0-9a-f]{8}", commit)
-        path = (folder / re.findall(r"\((.*?)\)", file)[0]).resolve()
-        stored = stored_by(commit, path)
-        assert stored is None or stored == path.read_bytes(), f"{commit} has another {path.name}"
         assert [each for each in numbers.split("; ") if each not in results and each != "the first figure"] == []
     said = {number for *_, numbers in rows for number in re.findall(r"\d+ of \d+", numbers)}
     assert {*re.findall(r"\d+ of \d+", results)} == said
+
+
+def test_a_file_of_results_is_what_a_commit_beside_it_stored():
+    folder = CHECKOUT / "docs" / "results"
+    page = (folder / "how_made.md").read_text(encoding="utf-8")
+    lines = [line for line in page.splitlines() if re.match(r"\|.*\]\([\w./]+\.(csv|json)\)", line)]
+    with_commits = [line for line in lines if re.search(r"\b[0-9a-f]{8}\b", line)]
+
+    assert len(with_commits) > 25 and len(lines) - len(with_commits) == 2  # streams and plasticity
+    for line in with_commits:
+        commits = re.findall(r"\b[0-9a-f]{8}\b", line)
+        for file in re.findall(r"\]\(([\w./]+\.(?:csv|json))\)", line):
+            path = (folder / file).resolve()
+            stored = {stored_by(commit, path) for commit in commits} - {None}
+            assert not stored or path.read_bytes() in stored, f"none of {commits} has this {path.name}"
+
+
+@pytest.mark.parametrize("experiment", ["task_free", "no_labels", "methods"])
+def test_a_modified_curriculum_of_an_experiment_has_the_stored_fingerprint(compose, experiment):
+    with (CHECKOUT / "docs" / "results" / f"{experiment}.csv").open(encoding="utf-8") as lines:
+        rows = list(csv.DictReader(lines))
+    choices = [] if experiment != "methods" else ["curriculum=fo_b1_4tasks"]
+    made = curriculum_of(compose(f"experiment={experiment}", *choices), Finetune())
+
+    stored = {row["fingerprint"] for row in rows if row["curriculum"] == made.name}
+    assert made.fingerprint in stored
+    assert curricula.load(made.name).fingerprint not in stored
 
 
 def test_every_example_with_stable_baselines3_sets_one_thread():
