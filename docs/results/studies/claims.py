@@ -24,6 +24,7 @@ from studies.verdicts import (
     compare_times,
     differences,
     effect_of_signs,
+    kept_by_holm,
     later,
     pairs,
     time,
@@ -126,6 +127,7 @@ class Row:
         number: what was found.
         effect: in the direction of the sentence; None where the number is exact.
         exact: the verdict on an exact number.
+        holm: whether the verdict stands after Holm's correction.
     """
 
     sentence: str
@@ -133,6 +135,7 @@ class Row:
     number: str
     effect: Effect | None
     exact: str = UNKNOWN
+    holm: bool = False
 
     @property
     def verdict(self) -> str:
@@ -144,7 +147,7 @@ class Row:
         """The verdict, with its reason where nothing can be said."""
         effect = self.effect
         if effect is None or self.verdict != UNKNOWN:
-            return f"**{self.verdict}**"
+            return f"**{self.verdict}**" + " (Holm)" * self.holm
         if effect.room < effect.counts:
             return f"**{UNKNOWN}**: no room for an effect"
         enough = f"fewer than {MOST_SEEDS} would not do" if effect.seeds is None else f"{effect.seeds} would do"
@@ -316,8 +319,8 @@ def similarity() -> list[Row]:
     words, transfer = compare_times(scratch, tuned, LATER)
     room = 1.0 if control.verdict == AGREES else 0.0
     forgotten = Effect(numbers_in(tuned, "forgetting"), OF_SUCCESS, 1.0)
-    number = f"scratch is {words}; on nested goals, the control, {nested}"
-    test = "transfer to later tasks: `scratch` against fine-tuning, PPO"
+    number = f"`scratch` is {words}; in the control, nested goals, {nested}"
+    test = "frames of later tasks: `scratch` against `finetune`, PPO"
     return [
         Row("dissimilar", "forgetting of fine-tuned PPO", f"{mean(tuned, 'forgetting'):.2f}", forgotten),
         Row("dissimilar", test, number, replace(transfer, room=room, absent=True)),
@@ -341,7 +344,8 @@ def waiting() -> list[Row]:
     rows = []
     for method in ("finetune", "clear", "mask_lc"):
         words, effect = compare_times(scratch, runs("shared_waiting", method=method), LATER)
-        rows.append(Row("waiting", f"`scratch` against `{method}`, later tasks", f"{words} from scratch", effect))
+        test = f"frames of later tasks: `scratch` against `{method}`, LSTM-PPO"
+        rows.append(Row("waiting", test, f"`scratch` is {words}", effect))
     return rows
 
 
@@ -358,7 +362,11 @@ def rows() -> list[Row]:
         similarity,
         waiting,
     )
-    return [row for part in parts for row in part()]
+    found = [row for part in parts for row in part()]
+    with_effect = [row for row in found if row.effect is not None]
+    kept = kept_by_holm([row.effect for row in with_effect if row.effect is not None])
+    standing = [with_effect[place] for place in kept]
+    return [replace(row, holm=row in standing) for row in found]
 
 
 def summary(found: Sequence[Row]) -> str:
@@ -392,6 +400,8 @@ def page() -> str:
         "num_agrees": verdicts.count(AGREES),
         "num_disagrees": verdicts.count(DISAGREES),
         "num_unknown": verdicts.count(UNKNOWN),
+        "num_intervals": sum(row.effect is not None for row in found),
+        "num_holm": sum(row.holm for row in found),
         "of_success": OF_SUCCESS,
         "of_failure": OF_FAILURE,
         "of_pairs": OF_PAIRS,

@@ -55,8 +55,12 @@ class Effect:
 
     @property
     def verdict(self) -> str:
-        """Whether the runs agree with the sentence, disagree, or cannot say."""
-        found = self.estimate
+        """`verdict_at` a level of 0.95."""
+        return self.verdict_at(ALPHA)
+
+    def verdict_at(self, alpha: float) -> str:
+        """Return whether the runs agree with the sentence, disagree, or cannot say, by an interval of 1 - alpha."""
+        found = statistics.mean(self.values, level=1 - alpha, bounds=self.bounds)
         if found.low is None or found.high is None or self.room < self.counts:
             return UNKNOWN
         if found.low > 0:
@@ -101,6 +105,18 @@ class Effect:
         if equal is None or not spread:
             return equal
         return max(equal, statistics.seeds_needed(self.counts, spread, paired=True))
+
+
+def kept_by_holm(effects: Sequence[Effect]) -> set[int]:
+    """Return the places of the effects whose verdicts stand after Holm's correction for their number."""
+    kept: set[int] = set()
+    found: set[int] | None = None
+    while found is None or found - kept:
+        kept |= found or set()
+        alpha = ALPHA / max(1, len(effects) - len(kept))
+        decided = [(place, each) for place, each in enumerate(effects) if each.verdict != UNKNOWN]
+        found = {place for place, each in decided if each.verdict_at(alpha) == each.verdict}
+    return kept
 
 
 def _sees_equal(effect: float, n: int, bounds: tuple[float, float]) -> bool:

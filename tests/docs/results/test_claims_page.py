@@ -98,7 +98,7 @@ def test_times_of_later_tasks_are_counted_from_the_raw_results(method, rows):
     [row] = [row for row in rows if f"against `{method}`" in row.test and row.sentence == "waiting"]
 
     assert row.effect.estimate.value == pytest.approx(np.mean(signs)) and len(signs) == 24
-    assert row.number.startswith(f"later in {signs.count(1)} of 24 pairs, earlier in {signs.count(-1)}")
+    assert row.number == f"`scratch` is later in {signs.count(1)} of 24 pairs, earlier in {signs.count(-1)}"
 
 
 @pytest.mark.parametrize(
@@ -135,6 +135,29 @@ def test_every_verdict_changes_where_the_raw_results_say_the_opposite(rows, tmp_
         changed |= {row.test for row in rows if found.get(row.test) != row.verdict}
 
     assert decided - changed == set()
+
+
+def test_verdicts_that_stand_after_holm_are_marked(rows):
+    """Sorted by how small an error their intervals allow, the k-th of 23 stands at 0.05 / (24 - k)."""
+    tested = [row for row in rows if row.effect is not None]
+    decided = [row for row in tested if row.verdict != UNKNOWN]
+
+    def holds(row, number):
+        return row.effect.verdict_at(0.05 / number) == row.verdict
+
+    marked = [row for row in rows if row.holm]
+    assert len(tested) == 23 and {row.test for row in decided if holds(row, 23)} <= {row.test for row in marked}
+    assert all(holds(row, 23 - len(marked) + 1) for row in marked)
+    assert not any(holds(row, 23 - len(marked)) for row in decided if not row.holm)
+    assert PAGE.count("** (Holm) |") == len(marked) == 8
+    assert f"over all 23 rows with an interval: {len(marked)}." in TEXT
+
+
+def test_a_row_whose_interval_is_above_0_agrees_however_small_its_effect(rows):
+    [row] = [row for row in rows if row.test.startswith("500 wait images")]
+
+    assert 0 < row.effect.estimate.low < row.effect.estimate.high < row.effect.counts
+    assert row.verdict == AGREES and not row.holm
 
 
 def test_no_verdict_is_given_on_empty_results(tmp_path, monkeypatch):
