@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from zlib import crc32
 
 import numpy as np
@@ -147,6 +148,23 @@ def test_what_the_text_says_of_five_seeds_is_so():
     assert statistics.compare([1.0] * 5, [0.0] * 5).p_value == 2 / 2**5
     assert statistics.pairs_needed(1.0, 0.0) == 6 and "Six can reach 0.03" in text
     assert statistics.pairs_needed(1.0, 0.0, comparisons=10) == 9 and "Holm's correction need nine" in text
+
+
+def test_the_table_of_seeds_is_that_of_the_function():
+    text = PAGE.read_text(encoding="utf-8")
+    found = re.findall(r"^\| (0\.\d) \| (\d+) \| (\d+) \| (\d+) \| (\d+) \|$", text, re.MULTILINE)
+
+    assert [row[0] for row in found] == ["0.1", "0.3", "0.5"]
+    for std, *shown in found:
+        assert [statistics.pairs_needed(gap, float(std)) for gap in (0.1, 0.2, 0.3, 0.5)] == list(map(int, shown))
+    assert "`ctgraph_rl.report.statistics.pairs_needed(0.3, std=0.5)` returns 24" in text
+
+
+def test_p_can_be_small_while_the_interval_holds_0():
+    differences = [0.2] * 6
+    found = statistics.compare(differences, [0.0] * 6, bounds=(-1, 1))
+
+    assert found.p_value <= 0.05 and found.difference.low < 0
 
 
 def test_what_the_page_reads_aloud_is_a_number_of_the_results_and_what_more_seeds_give_is_so():
