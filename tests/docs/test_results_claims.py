@@ -173,12 +173,15 @@ def test_the_published_settings_solve_depth_2_and_3_depth_4_once_and_not_5(make)
     by_count = [sum(float(line["greedy_success"]) >= 0.9 for line in cells["ppo_count", depth]) for depth in "2345"]
     plain = [sum(float(line["greedy_success"]) >= 0.9 for line in cells["ppo", depth]) for depth in "2345"]
     assert {float(line["sampled_success"]) for line in cells["ppo", "4"]} == {0.0}
-    assert "sampled they reach the goal in none of 1,000 episodes, so no seed has learned it" in RESULTS
+    assert (
+        "| `ppo` | 5 of 5 [0.48, 1] | 5 of 5 [0.48, 1] | 0 of 5 [0, 0.52], 2 by chance | 0 of 5 [0, 0.52] |" in RESULTS
+    )
+    assert "but sampled they reach the goal in none of 1,000 episodes, so no seed of these has learned it" in RESULTS
     assert (by_count, plain) == ([5, 5, 5, 5], [5, 5, 2, 0])
     assert "`ppo_count` solves every depth in every seed." in RESULTS
     assert "`ppo_count` learns depth 5 from scratch in every seed, in as many frames" in LIFELONG
     assert "it solves depth 2 and 3 in every seed, depth 4 in one of five, and depth 5 in none." in RESULTS
-    assert "One of its greedy policies at depth 5 is right by chance" in RESULTS
+    assert "| 1 of 5 [0.01, 0.72] | 0 of 5 [0, 0.52], 1 by chance |" in RESULTS
 
 
 def test_random_network_distillation_solves_depth_4_and_5_in_some_seeds_and_costs_little_where_waits_distract(make):
@@ -247,12 +250,12 @@ def test_cells_of_all_tables_were_run_again_and_only_those_of_the_earlier_revisi
     ):
         in_part = [int(line["numbers"]) // tasks - 1 for line in again if line["table"] == table]  # evaluations of 20
         assert (len(in_part), min(in_part), max(in_part)) == (count, least * 20, most * 20)
-    assert "of masks, those of the first 30 % or more of a block were compared" in HOW_MADE
+    assert "Of masks, the first 30 % or more of a block was compared" in HOW_MADE
     other_greedy = [(line["depth"], line["seed"]) for line in changed if line["equal"] not in "24"]
     assert other_greedy == [("4", "2")]
     assert [line["equal"] for line in changed if (line["depth"], line["seed"]) == ("5", "1")] == ["2"], "the greedy two"
     assert len(changed) == 20 and "The 20 cells of `ppo_published` on the depth ladder were replaced" in HOW_MADE
-    assert "two greedy numbers changed, those of seed 2 of depth 4 and seed 1 of depth 5" in HOW_MADE
+    assert "Two of their greedy numbers changed: seed 2 of depth 4 and seed 1 of depth 5" in HOW_MADE
 
 
 def of_seeds_together(of):

@@ -91,10 +91,16 @@ def ladder(raw: Raw) -> str:
         chance.append(f"{alone.num_frames / random_frames_to_goal(task):.2g}")
     rows = [["*goals that random actions find*", *chance]]
     for agent in dict.fromkeys(agent for agent, _ in of):
-        each = [numbers_in(of.get((agent, depth), []), "greedy_success") for depth in depths]
-        solved = [share_of([success >= SOLVED for success in seeds]) if seeds else "" for seeds in each]
-        rows.append([f"`{agent}`", *solved])
+        rows.append([f"`{agent}`", *(solved(of[agent, depth]) for depth in depths)])
     return table(["", *(f"depth {depth}" for depth in depths)], rows)
+
+
+def solved(lines: Raw) -> str:
+    """How many seeds have a greedy success of at least 0.9, and how many of them only by chance."""
+    right = [line for line in lines if float(line["greedy_success"]) >= SOLVED]
+    learned = [line for line in right if float(line["sampled_success"]) > 0]
+    by_chance = len(right) - len(learned)
+    return share_of([line in learned for line in lines]) + (f", {by_chance} by chance" if by_chance else "")
 
 
 def learned_and_met() -> dict[str, str]:
