@@ -9,8 +9,8 @@ from functools import cache
 from pathlib import Path
 
 import torch
-from results_of import FOLDER
 from short_runs import NAME, draw_curves, lines_of
+from studies.raw import HERE
 
 import curricula
 from ctgraph_rl.draw import curriculum_figure
@@ -50,7 +50,7 @@ def _file(name: str, kind: str) -> str:
 @cache
 def _code(kind: str) -> str:
     """Return a digest of what draws: the code, and the raw results of short runs."""
-    paths = [Path(__file__).with_name("short_runs.py"), FOLDER / f"{NAME}.csv"]
+    paths = [Path(__file__).with_name("short_runs.py"), HERE / f"{NAME}.csv"]
     if kind != "curves":
         paths = sorted(Path(curriculum_figure.__file__).parent.glob("*.py"))
     return hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()

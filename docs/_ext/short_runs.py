@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from functools import cache
 from pathlib import Path
 from statistics import fmean
 
-from results_of import PAGE, Line, raw
-from studies.raw import mean_of, numbers_in
+from results_of import PAGE
+from studies.raw import Raw, groups, mean_of, numbers_in, read, select
 
 from ctgraph_rl import Curriculum
 from ctgraph_rl.draw.style import new_figure, save_figure
@@ -55,12 +55,10 @@ TITLES = {
 }
 
 
-def lines_of(name: str) -> dict[tuple[str, str], list[Line]]:
+@cache
+def lines_of(name: str) -> dict[tuple[str, ...], Raw]:
     """Return the lines of a curriculum's short runs by agent and method, in the order of `METHODS`."""
-    found: dict[tuple[str, str], list[Line]] = defaultdict(list)
-    for line in raw(NAME):
-        if line["curriculum"] == name:
-            found[line["agent"], line["method"]].append(line)
+    found = groups(select(read(NAME), curriculum=name), "agent", "method")
     return dict(sorted(found.items(), key=lambda item: list(METHODS).index(item[0][1])))
 
 
@@ -84,14 +82,14 @@ def sentence_of(curriculum: Curriculum) -> str:
     )
 
 
-def _frames(curriculum: Curriculum, line: Line) -> str:
+def _frames(curriculum: Curriculum, line: dict[str, str]) -> str:
     """Return the frames of a block, and those of the curriculum where a run was shorter."""
     ran, full = int(line["block_frames"]), curriculum.blocks[0].num_frames
     what = "frames a task" if len(curriculum.blocks) > 1 else "frames"
     return f"{ran:,} {what}" if ran == full else f"{ran:,} instead of {full:,} {what}"
 
 
-def _reached(method: str, lines: list[Line], bounds: Bounds) -> str:
+def _reached(method: str, lines: Raw, bounds: Bounds) -> str:
     """Return the mean return at the end with its interval, and right after each task's own block."""
     first = lines[0]
     ids = IDS[first["task_id"]]
@@ -104,7 +102,7 @@ def _reached(method: str, lines: list[Line], bounds: Bounds) -> str:
     return f"{number} with {METHODS[method]} ({seeds}{ids}; {own:.2f} right after each task)"
 
 
-def _known(line: Line) -> str:
+def _known(line: dict[str, str]) -> str:
     """Return the optimum and what random actions have, where they are known."""
     if not line["optimum"]:
         return ""

@@ -10,7 +10,6 @@ import argparse
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 HERE = Path(__file__).resolve().parent
 
@@ -37,24 +36,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     commands = parser.add_subparsers(metavar="NAME")
     for name in PAGES:
         commands.add_parser(name).set_defaults(run=lambda options, name=name: _make(name))
-    _add_measurements(commands)
+    measuring = commands.add_parser("gpu", help="measure a GPU for four minutes, into gpu.json and its page")
+    measuring.add_argument("--minutes", type=float, default=4.0, help="limit of a call; the next call continues")
+    measuring.add_argument("--commit", default="", help="what is measured, where the checkout has no .git")
+    measuring.set_defaults(run=lambda options: import_module("studies.gpu").measure(options.minutes, options.commit))
     options = parser.parse_args(arguments)
     try:
         options.run(options)
     except (OSError, KeyError, ValueError) as error:
         parser.error(str(error))
-
-
-def _add_measurements(commands: Any) -> None:
-    """Add the commands that write raw results."""
-    measuring = commands.add_parser("gpu", help="measure a GPU for four minutes, into gpu.json and its page")
-    measuring.add_argument("--minutes", type=float, default=4.0, help="limit of a call; the next call continues")
-    measuring.add_argument("--commit", default="", help="what is measured, where the checkout has no .git")
-    measuring.add_argument("--seconds", type=float, default=1.0, help="least time of a measurement")
-    measuring.add_argument("--rows", type=int, nargs="+", default=[65536, 262144], help="of the environment")
-    measuring.add_argument("--envs", type=int, nargs="+", default=[256, 4096, 65536], help="of one agent")
-    measuring.add_argument("--together", type=int, nargs="+", default=[64, 1024], help="seeds of one job")
-    measuring.set_defaults(run=lambda options: import_module("studies.gpu").measure(options))
 
 
 def _make(*names: str) -> None:

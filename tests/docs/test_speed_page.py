@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import csv
 import json
 import re
@@ -191,6 +190,7 @@ def test_what_the_page_says_of_gpus_in_words_was_measured(gpu):
 def two_rungs(gpu, monkeypatch) -> list[str]:
     """Rungs of learning, the last one of seeds as one job, and one of the environment; the names of those measured."""
     measured: list[str] = []
+    monkeypatch.setattr(gpu, "SECONDS", 0.001)
     monkeypatch.setattr(gpu, "TESTS", ("-c", "print('FAILED one'); print('1 failed')"))
     names = {gpu.ladder: (gpu.ladder.COPY,), gpu.learning: ("ppo, captured", "lstm_ppo, 1,024 seeds as one job")}
     for module, ways in names.items():
@@ -209,11 +209,8 @@ def two_rungs(gpu, monkeypatch) -> list[str]:
     return measured
 
 
-OPTIONS = argparse.Namespace(minutes=0.4, seconds=0.001, rows=[2], envs=[2], together=[2], commit="abc")
-
-
 def test_a_report_of_a_gpu_has_its_parts_the_most_important_first_and_the_time_of_many_seeds(gpu, two_rungs):
-    report = dict(gpu.parts(torch.device("cpu"), OPTIONS, {}))
+    report = dict(gpu.parts(torch.device("cpu"), 0.4, "abc", {}))
     text = gpu.section(json.loads(json.dumps(report)))
 
     assert two_rungs == ["lstm_ppo, 1,024 seeds as one job", "ppo, captured", gpu.ladder.COPY]
@@ -225,14 +222,14 @@ def test_a_report_of_a_gpu_has_its_parts_the_most_important_first_and_the_time_o
 
 
 def test_a_report_of_a_gpu_goes_on_where_it_stopped_unless_the_commit_is_another(gpu, two_rungs):
-    report = json.loads(json.dumps(dict(gpu.parts(torch.device("cpu"), OPTIONS, {}))))
+    report = json.loads(json.dumps(dict(gpu.parts(torch.device("cpu"), 0.4, "abc", {}))))
     del report["learning"][0], report["environment"]
     kept = report["learning"][0]
     two_rungs.clear()
 
-    again = dict(gpu.parts(torch.device("cpu"), OPTIONS, report))
+    again = dict(gpu.parts(torch.device("cpu"), 0.4, "abc", report))
     goes_on = list(two_rungs)
-    dict(gpu.parts(torch.device("cpu"), OPTIONS, {**report, "commit": "other"}))
+    dict(gpu.parts(torch.device("cpu"), 0.4, "abc", {**report, "commit": "other"}))
 
     assert goes_on == ["ppo, captured", gpu.ladder.COPY]
     assert again["learning"][1] == kept and again["tests"] == report["tests"]
@@ -240,9 +237,7 @@ def test_a_report_of_a_gpu_goes_on_where_it_stopped_unless_the_commit_is_another
 
 
 def test_no_measurement_of_a_gpu_begins_after_the_time_of_a_call(gpu, two_rungs):
-    late = argparse.Namespace(**{**vars(OPTIONS), "minutes": 0.0})
-
-    report = dict(gpu.parts(torch.device("cpu"), late, {"commit": "abc"}))
+    report = dict(gpu.parts(torch.device("cpu"), 0.0, "abc", {"commit": "abc"}))
 
     assert two_rungs == [] and report["learning"] == []
     assert report["tests"]["exit_code"] is None

@@ -87,7 +87,7 @@ def test_a_card_of_a_curriculum_has_its_parts(site):
 def test_the_card_of_every_named_curriculum_has_a_line_on_results(site):
     """A study's page, or short runs, which are never of the same curriculum, or that there is no run yet."""
     short_runs = site("short_runs")
-    run = {line["curriculum"] for line in short_runs.raw(short_runs.NAME)}
+    run = {line["curriculum"] for line in short_runs.read(short_runs.NAME)}
 
     first = {}
     for name in curricula.names():

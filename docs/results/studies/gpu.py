@@ -8,7 +8,6 @@ Where there is no GPU, it writes the section alone, from the gpu.json that is th
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 import subprocess
@@ -31,56 +30,63 @@ TESTS = ("-m", "pytest", "-q", "-m", "cuda", "-n", "0", "tests/learn/test_cuda.p
 SECTION = re.compile(r"(?<=<!-- gpu -->\n).*?(?=<!-- end of gpu -->)", re.DOTALL)
 
 
+ROWS = (65536, 262144)
+"""Of the environment."""
+
+ENVS = (256, 4096, 65536)
+"""Of one agent."""
+
+TOGETHER = (64, 1024)
+"""Seeds of one job."""
+
+SECONDS = 1.0
+"""The least time of a measurement."""
+
 SHARE = 0.75
 """Of the minutes of a call; no measurement begins after it, so that the last one ends in time."""
 
 
-def measure(options: argparse.Namespace) -> None:
-    """Measure, and write the file and the page."""
+def measure(minutes: float, commit: str) -> None:
+    """Measure, and write the file and the page; see `parts`."""
     found = json.loads(FILE.read_text()) if FILE.exists() else None
     if torch.cuda.is_available():
         before = found or {}
         found = {}
-        for name, part in parts(torch.device("cuda"), options, before):
+        for name, part in parts(torch.device("cuda"), minutes, commit or present_commit(), before):
             found[name] = part
             FILE.write_text(json.dumps(found, indent=1) + "\n")
     PAGE.write_text(with_section(PAGE.read_text(encoding="utf-8"), found), encoding="utf-8")
 
 
-def parts(device: torch.device, options: argparse.Namespace, before: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+def parts(device: torch.device, minutes: float, commit: str, before: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     """Yield the parts of the report by name, each again after every measurement; the most important first.
 
     Args:
         device: what is measured.
-        options: of the command line.
+        minutes: limit of a call.
+        commit: what is measured.
         before: the report of an earlier call, which is continued if it is of the same commit and device.
     """
-    end = time.perf_counter() + SHARE * 60 * options.minutes
+    end = time.perf_counter() + SHARE * 60 * minutes
     about = {"device": ladder.machine(device), "driver": said("nvidia-smi", *DRIVER), "versions": versions()}
-    commit = options.commit or present_commit()
     known = before if before.get("commit") == commit and before.get("machine") == about else {}
     yield "machine", about
     yield "commit", commit
     finished = known.get("tests", {}).get("exit_code") is not None
     yield "tests", known["tests"] if finished else tested(end - time.perf_counter())
-    agents = list(learning.rungs(device, options.envs, options.together))
-    environment = ladder.rungs(device, options.rows, configurations())
+    agents = list(learning.rungs(device, ENVS, TOGETHER))
+    environment = ladder.rungs(device, ROWS, configurations())
     for name, rungs, yardstick in (
         ("learning", agents, learning.ENVIRONMENT),
         ("environment", environment, ladder.COPY),
     ):
         left = continued(rungs, known.get(name, []))
         yield name, ladder.found(rungs, yardstick)
-        for rung in sorted(left, key=importance):
+        for rung in sorted(left, key=lambda rung: ("seeds as one job" not in rung.name, rung.num_rows)):
             if time.perf_counter() > end:
                 break
-            ladder.measure(rung, 3, options.seconds, device)
+            ladder.measure(rung, 3, SECONDS, device)
             yield name, ladder.found(rungs, yardstick)
-
-
-def importance(rung: ladder.Rung) -> tuple[bool, int]:
-    """Return what rungs are sorted by: seeds as one job first, then those with few environments."""
-    return "seeds as one job" not in rung.name, rung.num_rows
 
 
 def continued(rungs: Sequence[ladder.Rung], rows: Sequence[Mapping[str, Any]]) -> list[ladder.Rung]:
