@@ -109,7 +109,7 @@ def test_the_page_is_what_its_raw_results_make(cells):
 
 def test_each_run_is_one_line_with_the_share_of_the_gap_or_its_reason(cells):
     conditions = {
-        "memory_cells": cells.graphs.Condition._fields,
+        "memory_cells": (*GRAPH[:3], "guide_frames", "read_noise"),
         "memory_ladder": ("depth", "expected_length", *SETTINGS),
     }
 
@@ -309,7 +309,7 @@ def test_the_commands_of_the_page_make_its_runs(cells):
     text = (FOLDER / "memory.md").read_text(encoding="utf-8").replace("\\\n", " ")
     commands = [line for line in text.splitlines() if line.startswith("ctgraph-rl -m experiment=")]
     conditions = {
-        "memory_cells": cells.graphs.Condition._fields,
+        "memory_cells": (*GRAPH[:3], "guide_frames", "read_noise"),
         "memory_ladder": ("depth", "expected_length", *SETTINGS),
     }
     recorded = (set(read(name, "agent", "seed", *keys)) for name, keys in conditions.items())

@@ -6,12 +6,23 @@ from itertools import pairwise
 from statistics import fmean
 
 from studies.collectives import mosaic, selecting
-from studies.collectives.l2d2c import new_and_known, on_l2d2c
-from studies.raw import groups, numbers_in, read
+from studies.collectives.l2d2c import BLOCKS, on_l2d2c
+from studies.raw import Raw, groups, numbers_in, read
 
 from helpers.conclusions.sentences import Sentences
 
 says = Sentences()
+
+
+def new_and_known(num_members: str) -> tuple[Raw, Raw]:
+    """Return the blocks whose task no member had in an earlier block, and the others."""
+    new: Raw = []
+    known: Raw = []
+    for lines in groups(on_l2d2c(num_members, name=BLOCKS), "seed", "task").values():
+        first = min(int(line["block"]) for line in lines)
+        for line in lines:
+            (known if int(line["block"]) > first else new).append(line)
+    return new, known
 
 
 @says(

@@ -42,17 +42,17 @@ SUMS = {"isolated": (9.5, 1.0), "mosaic": (25.7, 0.8), "mosaic_no_similarity": (
 NUM_PUBLISHED = 5
 
 
-def blocks(exchange: str, num_epochs: str, num_members: str) -> Raw:
-    """Return the blocks of the members of some collectives: one for each seed and member."""
+def blocks(exchange: str, num_members: str) -> Raw:
+    """Return the blocks of the members of some collectives, one epoch: one for each seed and member."""
     lines = select(read(BLOCKS), curriculum=CURRICULUM, exchange=exchange)
-    return select(lines, num_epochs=num_epochs, num_members=num_members)
+    return select(lines, num_epochs="1", num_members=num_members)
 
 
 def by_depth(exchange: str, num_members: str) -> dict[int, list[float]]:
     """Return final returns by depth: isolated members' own values, of others means of a seed."""
     found: dict[int, list[float]] = {}
     for depth in DEPTHS:
-        lines = [line for line in blocks(exchange, "1", num_members) if 1 + line["task"].count(".") == depth]
+        lines = [line for line in blocks(exchange, num_members) if 1 + line["task"].count(".") == depth]
         samples = groups(lines, "seed", "member") if exchange == "isolated" else groups(lines, "seed")
         found[depth] = [fmean(numbers_in(sample, "final_return")) for sample in samples.values()]
     return found
@@ -61,7 +61,7 @@ def by_depth(exchange: str, num_members: str) -> dict[int, list[float]]:
 def sums(exchange: str, num_members: str) -> list[float]:
     """Return the sum of the final returns of all members of each seed; isolated members are run in two halves."""
     halves = exchange == "isolated"
-    lines = blocks(exchange, "1", HALF if halves else num_members)
+    lines = blocks(exchange, HALF if halves else num_members)
     found = {int(seed): math.fsum(numbers_in(each, "final_return")) for (seed,), each in groups(lines, "seed").items()}
     if not halves:
         return list(found.values())
@@ -104,14 +104,14 @@ def verdicts() -> str:
 
 def never(exchange: str) -> str:
     """Return the tasks, among 28 members, whose final return is below 0.5 in each seed."""
-    of = groups(blocks(exchange, "1", ALL), "task", "member")
+    of = groups(blocks(exchange, ALL), "task", "member")
     failed = [task for (task, _), lines in of.items() if max(numbers_in(lines, "final_return")) < 0.5]
     return ", ".join(f"`{task.removeprefix('goal')}`" for task in failed) or "none"
 
 
 def most_apart() -> tuple[int, float]:
     """Return the depth at which MOSAIC's sum of returns differs most from the published one, and by how much."""
-    tasks = {line["task"] for line in blocks("mosaic", "1", ALL)}
+    tasks = {line["task"] for line in blocks("mosaic", ALL)}
     apart = {}
     for (depth, values), stated in zip(by_depth("mosaic", ALL).items(), SHARED, strict=True):
         count = sum(1 + task.count(".") == depth for task in tasks)
@@ -156,8 +156,4 @@ def texts() -> dict[str, str]:
         "never_any": never("mosaic_no_similarity"),
     }
     depth, apart = most_apart()
-    found |= {"apart_depth": str(depth), "apart": f"{apart:+.1f}"}
-    for epochs in ("1", "8"):
-        shares = [float(line["share_below"]) for line in blocks("isolated", epochs, HALF) if line["share_below"]]
-        found |= {f"below_{epochs}": f"{fmean(shares):.2f}", f"below_n_{epochs}": str(len(shares))}
-    return found
+    return found | {"apart_depth": str(depth), "apart": f"{apart:+.1f}"}

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 from studies.raw import Raw, groups, numbers_in, read
 
 NAME = "memory_cells"
+LADDER = "memory_ladder"
 
 SEEDS = 5
 
 SOLVED = 0.9
 """The least greedy return of a seed that solves a task; the optimum is 1."""
-
-NOISE = "25"
-"""The largest addition to each pixel in the conditions with noise."""
 
 GUIDED = "204800"
 """The frames over which a policy that navigates gives the first rewards."""
@@ -88,22 +85,3 @@ def solved(lines: Raw) -> list[bool]:
 def solved_once(lines: Raw) -> list[bool]:
     """Return for each seed whether it solves the task at any evaluation."""
     return [bool(line["frames_to_90"]) for line in lines]
-
-
-def count(lines: Raw) -> str:
-    """Return how many seeds solve the task after training, as ``4 of 5``."""
-    return f"{sum(solved(lines))} of {len(lines)}"
-
-
-def ranking(of: Mapping[str, Raw]) -> str:
-    """Return the agents by how many seeds solve the task after training, as ``4 of 5: LSTM, GRU; 0 of 5: A2C``."""
-    by_count: dict[int, list[str]] = {}
-    for name, lines in of.items():
-        by_count.setdefault(sum(solved(lines)), []).append(AGENTS[name])
-    last = min(by_count)
-    if len(by_count) == 1:
-        return f"{last} of {SEEDS} with all {len(of)} agents"
-    parts = [f"{number} of {SEEDS}: {', '.join(by_count[number])}" for number in sorted(by_count, reverse=True)]
-    if len(by_count[last]) > 4:
-        parts[-1] = f"{last} of {SEEDS}: the other {len(by_count[last])}"
-    return "; ".join(parts)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
-import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from statistics import fmean
 
 from ctgraph_rl.report import statistics
@@ -12,12 +10,9 @@ from ctgraph_rl.report.statistics import Comparison
 from studies.memory.conditions import (
     AGENTS,
     GIVEN,
-    NOISE,
     SHARED,
     TO_FIND,
     UNIQUE,
-    Condition,
-    count,
     finished,
     solved,
     solved_once,
@@ -39,9 +34,6 @@ RIVALS = (
 )
 """The agents that the claim names, in its order."""
 
-POOR = 1
-"""The most seeds of five that solve a graph on which an agent is said to do poorly."""
-
 OF_CLAIM = {
     "shared, given": SHARED,
     "shared, to be found": TO_FIND[0],
@@ -54,20 +46,6 @@ OF_CLAIM = {
 def ceiling(of: Mapping[str, Raw]) -> float:
     """Return the best return without memory on a graph."""
     return float(next(iter(of.values()))[0]["ceiling_without_memory"])
-
-
-def with_noise() -> str:
-    """Return how many of all runs with noise solve the task after training, and of those without."""
-    of = finished()
-    noise: Raw = []
-    plain: Raw = []
-    for condition in GIVEN:
-        noisy = condition._replace(read_noise=NOISE)
-        if noisy in of:
-            for name in ("lstm_ppo", "lstm_ppo-gru"):
-                noise += of[noisy][name]
-                plain += of[condition][name]
-    return f"{count(noise)} runs with noise and {count(plain)} without"
 
 
 def totals() -> dict[str, Raw]:
@@ -119,45 +97,6 @@ def lower_and_undecided() -> tuple[str, str]:
     return str(len(lower)), "; ".join(others)
 
 
-def lost() -> str:
-    """Return how many runs that solved the task at an evaluation did not after training, by agent; without noise."""
-    of = finished()
-    once = {}
-    gone = {}
-    for name in AGENTS:
-        lines = [line for condition in (*GIVEN, *TO_FIND) for line in of[condition].get(name, [])]
-        once[name] = sum(solved_once(lines))
-        gone[name] = sum(map(operator.gt, solved_once(lines), solved(lines)))
-    worst = sorted((name for name in AGENTS if gone[name]), key=lambda name: -gone[name] / once[name])
-    parts = ", ".join(f"{AGENTS[name]} {gone[name]} of {once[name]}" for name in worst)
-    whole = f"Of {sum(once.values())} runs that solved the task at an evaluation, {sum(gone.values())}"
-    return f"{whole} did not after training: {parts}"
-
-
-def cut_off(steps: int) -> str:
-    """Return the share of frames whose episode continues after their batch, for each p of the graphs, as ``25 %``.
-
-    Rows begin together, play the optimal policy, which waits a geometric time before each decision and before the
-    end, and are seen after many batches; at p = 0 all stay in step.
-    """
-    shares = [_share_cut_off(wait_prob, steps) for wait_prob in (0.0, 0.5, 0.9)]
-    return listed([f"{100 * share:.0f} %" for share in shares])
-
-
-def _share_cut_off(wait_prob: float, steps: int, depth: int = 2) -> float:
-    waits = depth + 1
-    if wait_prob == 0:
-        length = 2 * waits
-        return sum(steps * batch % length for batch in range(length)) / length / steps
-    ways = (math.comb(n - 1, depth) * (1 - wait_prob) ** waits * wait_prob ** (n - waits) for n in range(waits, 2000))
-    longer = 1.0
-    shares = [1.0] * (2 * waits - 1)
-    for probability in ways:
-        shares.append(longer)
-        longer -= probability
-    return sum(min(age, steps) * share for age, share in enumerate(shares)) / sum(shares) / steps
-
-
 def claim_table() -> str:
     """Return a line for each rival and MOHQA, a column for each graph that the claim can be about.
 
@@ -169,14 +108,3 @@ def claim_table() -> str:
         cells = [of[condition][name] for condition in OF_CLAIM.values()]
         rows.append([AGENTS[name], *(f"{sum(solved(lines))} ({sum(solved_once(lines))})" for lines in cells)])
     return table(["", *OF_CLAIM], rows)
-
-
-def better_than_poor(condition: Condition) -> str:
-    """Return the rivals that more than `POOR` seeds solve a graph with."""
-    of = finished()[condition]
-    return listed([AGENTS[name] for name in RIVALS if sum(solved(of[name])) > POOR])
-
-
-def listed(names: Sequence[str]) -> str:
-    """Return names as a list in a sentence."""
-    return f"{', '.join(names[:-1])} and {names[-1]}" if len(names) > 1 else "".join(names) or "no agent"
