@@ -255,17 +255,13 @@ def measure(rung: Rung, rounds: int, seconds: float, device: torch.device) -> No
         run()
         at_once = max(1, min(10, round(seconds / (finished(device) - start))))
         for _ in range(rounds):
-            rung.speeds.append(_speed(run, at_once, seconds=seconds, device=device))
+            count = 0
+            start = finished(device)
+            while (now := finished(device)) - start < seconds:
+                count += sum(run() for _ in range(at_once))
+            rung.speeds.append(count / (now - start))
     except (RuntimeError, torch.OutOfMemoryError) as error:
         rung.failure = f"{type(error).__name__}: {error}".splitlines()[0]
-
-
-def _speed(run: TimedRun, at_once: int, seconds: float, device: torch.device) -> float:
-    count = 0
-    start = finished(device)
-    while (now := finished(device)) - start < seconds:
-        count += sum(run() for _ in range(at_once))
-    return count / (now - start)
 
 
 def finished(device: torch.device) -> float:

@@ -65,14 +65,13 @@ class Stable:
         more = translated(name, given) if like_ours else {}
         self.model = KINDS[name](policy, make_env(task, num_rows), seed=seed, device="cpu", **more)
         if name == "dqn" and like_ours:
-            self.model.exploration_schedule = self._exploration(given)
+            first = given["eps_init"]
+            last = given["eps_end"]
+            frames = given["annealing_num_steps"]
+            self.model.exploration_schedule = lambda _: max(
+                last, first - (first - last) * self.model.num_timesteps / frames
+            )
         self.frames = max(num_rows * getattr(self.model, "n_steps", given["num_steps"]), 1024)
-
-    def _exploration(self, given: Mapping[str, Any]) -> Callable[[float], float]:
-        first = given["eps_init"]
-        last = given["eps_end"]
-        frames = given["annealing_num_steps"]
-        return lambda _: max(last, first - (first - last) * self.model.num_timesteps / frames)
 
     def learn(self) -> int:
         """Learn from one batch, or several small ones."""

@@ -267,19 +267,24 @@ def _shown(task: Task, ids: ReadOnlyValues) -> Observations:
 def _in_order(by_seed: Sequence[Tasks], goals: Any, num_goals: int, order: str, seed: int) -> Tasks:
     require(*one_of(ORDERS, order=order), *at_least_one(num_goals=num_goals))
     depths = {graph.graph.depth for graph in by_seed[0]}
-    given = goals
+    listed: tuple[Any, ...] = ()
     if not isinstance(goals, str) or goals not in GOALS:
-        goals = several(goals)
-        read = [read_goal(goal) for goal in goals]
+        listed = several(goals)
+        read = [read_goal(goal) for goal in listed]
         are_goals = all(isinstance(goal, tuple) for goal in read)
-        require((are_goals, f"goals must be one of {', '.join(GOALS)}, or a list such as [1.2,2.1], got {given!r}"))
+        require((are_goals, f"goals must be one of {', '.join(GOALS)}, or a list such as [1.2,2.1], got {goals!r}"))
         example = ",".join(".".join("1" * depth) for depth in sorted(depths))
-        rule = f"goals must have as many decisions as the depths, {sorted(depths)}, and some for each; got {given!r}; "
-        rule += f"write them as [{example}]"
-        require(({len(goal) for goal in read} == depths, rule))  # type: ignore[arg-type]
-    with_goals = []
-    for graphs in by_seed:
-        with_goals.append([_with_goals(graph, goals, num_goals, seed) for graph in graphs])
+        rule = f"goals must have as many decisions as the depths, {sorted(depths)}, and some for each; got {goals!r}; "
+        require(({len(goal) for goal in read} == depths, f"{rule}write them as [{example}]"))  # type: ignore[arg-type]
+
+    def with_goals_of(task: Task) -> Tasks:
+        if listed:
+            return axes.given_goals(task, [goal for goal in listed if len(read_goal(goal)) == task.graph.depth])  # type: ignore[arg-type]
+        if goals == "random":
+            return axes.random_goals(task, num_goals, seed)
+        return axes.all_goals(task) if goals == "all" else axes.as_tasks(task)
+
+    with_goals = [list(map(with_goals_of, graphs)) for graphs in by_seed]
     sequences = [axes.concatenate(*graphs) for graphs in with_goals]
     if order == "interleave":
         return axes.interleave(*(sequences if len(sequences) > 1 else with_goals[0]))
@@ -287,14 +292,6 @@ def _in_order(by_seed: Sequence[Tasks], goals: Any, num_goals: int, order: str, 
     if order == "shuffle":
         return axes.shuffle(tasks, seed)
     return axes.reverse(tasks) if order == "reverse" else tasks
-
-
-def _with_goals(task: Task, goals: str | tuple[Goal, ...], num_goals: int, seed: int) -> Tasks:
-    if goals == "random":
-        return axes.random_goals(task, num_goals, seed)
-    if isinstance(goals, str):
-        return axes.all_goals(task) if goals == "all" else axes.as_tasks(task)
-    return axes.given_goals(task, [goal for goal in goals if len(read_goal(goal)) == task.graph.depth])  # type: ignore[arg-type]
 
 
 def _curriculum(

@@ -137,6 +137,10 @@ def _observation_params(tasks: _Different, bank: Bank) -> ObservationParams:
     def first_noise(task: Task) -> int:
         return bank.noise_levels.index(task.observations.read_noise) * bank.num_noises
 
+    taps = None
+    if most_angles > 1:
+        index, weight = zip(*(compute_taps(bank.shape[-1], angle) for angle in range(most_angles)), strict=True)
+        taps = torch.stack(index).to(tasks.device), torch.stack(weight).to(tasks.device)
     return ObservationParams(
         first_kind=first_kind if len(tasks.tasks) > 1 else None,
         first_view=tasks.each_kind(first_view),
@@ -152,14 +156,8 @@ def _observation_params(tasks: _Different, bank: Bank) -> ObservationParams:
         white=each(lambda task: white_level(task.images), torch.float64),
         noise_start=each(first_noise),
         legacy=_legacy_index(tasks) if tasks.some("observations.legacy_index") else None,
-        taps=_taps(bank.shape[-1], most_angles, tasks.device) if most_angles > 1 else None,
+        taps=taps,
     )
-
-
-def _taps(size: int, angles: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    taps = [compute_taps(size, angle) for angle in range(angles)]
-    index, weight = map(torch.stack, zip(*taps, strict=True))
-    return index.to(device), weight.to(device)
 
 
 def _is_by_node(task: Task, kind: StateType) -> bool:

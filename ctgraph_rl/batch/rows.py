@@ -85,7 +85,8 @@ class Rows(TakesNumbers, nn.Module):
             self.pool: Sequence[Task] = task_pool
             self.examples = task_pool.examples
         else:
-            self.pool = self.examples = _different(tasks if task_pool is None else task_pool)
+            pool = tasks if task_pool is None else require_all(Task, "task_pool", task_pool)
+            self.pool = self.examples = tuple(dict.fromkeys(pool))
         self.num_rows = len(tasks)
         require(
             seed_rule(seed),
@@ -395,10 +396,6 @@ class Rows(TakesNumbers, nn.Module):
         self._take_params()
         self._choose_engine()
         return self
-
-
-def _different(tasks: Iterable[Task]) -> tuple[Task, ...]:
-    return tuple(dict.fromkeys(require_all(Task, "task_pool", tasks)))
 
 
 _ASSIGNED = ("task", "choice", "episodes")

@@ -264,11 +264,8 @@ def _why_too_much(folder: Path, disk: int) -> str | None:
         return f"it made more than {MOST_FILES:,} files"
     if 512 * sum(map(int, blocks)) > disk:
         return f"it wrote more than {disk:,} bytes"
-    return f"less than {LEAST_FREE:,} bytes of the disk stay free" if _free(folder) < LEAST_FREE else None
-
-
-def _free(folder: Path) -> int:
-    return shutil.disk_usage(folder).free
+    free = shutil.disk_usage(folder).free
+    return f"less than {LEAST_FREE:,} bytes of the disk stay free" if free < LEAST_FREE else None
 
 
 def strip_privileges(folder: Path) -> None:

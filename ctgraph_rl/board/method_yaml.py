@@ -88,10 +88,6 @@ COUNT = Kind(lambda value: is_int(value, 0), "an integer >= 0")
 HOURS = or_null(Kind(lambda value: is_real(value, 0), "a number >= 0"))
 
 
-def _are_reasons(value: object) -> bool:
-    return isinstance(value, Mapping) and are_ints(list(value), 0) and all(map(TEXT.holds, value.values()))
-
-
 KINDS = {
     "name": TEXT,
     "track": or_null(TEXT),
@@ -113,7 +109,10 @@ KINDS = {
     "compute.hardware": or_null(TEXT),
     "compute.hours": HOURS,
     "compute.tuning_hours": HOURS,
-    "failed": Kind(_are_reasons, "a reason for each seed, such as {3: out of memory}"),
+    "failed": Kind(
+        lambda value: isinstance(value, Mapping) and are_ints([*value], 0) and all(map(TEXT.holds, value.values())),
+        "a reason for each seed, such as {3: out of memory}",
+    ),
 }
 """Fields by dotted names; only ``track_version`` may be missing, which ``submit`` writes."""
 

@@ -219,7 +219,11 @@ def checks_of(run: SubmittedRun, submitted: RunLog, result: Rerun, other_bits: S
     log = equal("log of the rerun", run.log_sha256, log_sum(result.log), run.run)
     note = "" if log.passed else first_difference(submitted, result.log)
     checks = [log._replace(note=note), equal("agent of the rerun", run.agent_sha256, result.agent_sha256, run.run)]
-    checks.append(_size_check(run, result.agent_bytes, other_bits))
+    size = equal(BYTES, run.agent_bytes, result.agent_bytes, run.run)
+    if other_bits and run.agent_bytes is not None and result.agent_bytes is not None:
+        alike = abs(result.agent_bytes - run.agent_bytes) <= OTHER_SIZE * run.agent_bytes
+        size = size._replace(expected=f"{run.agent_bytes}, within {OTHER_SIZE:.0%}", passed=alike)
+    checks.append(size)
     return [check._replace(level=RERUN) for check in checks]
 
 
@@ -253,13 +257,6 @@ def submitted_scores(submission: Submission) -> list[float]:
         if value is not None:
             found.append(value)
     return found
-
-
-def _size_check(run: SubmittedRun, found: int | None, other_bits: Sequence[str]) -> Check:
-    if not other_bits or run.agent_bytes is None or found is None:
-        return equal(BYTES, run.agent_bytes, found, run.run)
-    alike = abs(found - run.agent_bytes) <= OTHER_SIZE * run.agent_bytes
-    return Check(BYTES, f"{run.agent_bytes}, within {OTHER_SIZE:.0%}", str(found), alike, run.run)
 
 
 def check_of_scores(submission: Submission, found: Sequence[float], what: str, level: str, note: str = "") -> Check:

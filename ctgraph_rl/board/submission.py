@@ -56,21 +56,15 @@ ANY_TEXT = Kind(lambda value: isinstance(value, str), "a text")
 SUM = matching("[0-9a-f]{64}", "64 hexadecimal digits")
 
 
-def _are_texts(value: object) -> bool:
-    return isinstance(value, dict) and all(isinstance(each, str) for each in value.values())
-
-
-def _are_runs(value: object) -> bool:
-    return isinstance(value, list) and 0 < len(value) <= MOST_RUNS
-
-
 PARTS = {
     "schema": Kind(lambda value: is_int(value, SCHEMA, SCHEMA), str(SCHEMA)),
     "method": OBJECT,
     "config": Kind(OBJECT.holds, "settings"),
-    "versions": Kind(_are_texts, "texts by name"),
+    "versions": Kind(
+        lambda value: isinstance(value, dict) and all(map(ANY_TEXT.holds, value.values())), "texts by name"
+    ),
     "curriculum": OBJECT,
-    "runs": Kind(_are_runs, f"a list of 1..{MOST_RUNS:,}"),
+    "runs": Kind(lambda value: isinstance(value, list) and 0 < len(value) <= MOST_RUNS, f"a list of 1..{MOST_RUNS:,}"),
 }
 
 RUN = {

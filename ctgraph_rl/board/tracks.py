@@ -8,7 +8,7 @@ be given less than the track gives: each of these is a `Variant`.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property
@@ -104,7 +104,17 @@ class Track:
             chosen = tuple(filterfalse(_is_value, rung))
             if chosen not in cfgs:
                 cfgs[chosen] = config.composed([f"{GROUP}={self.name}", *chosen], self.config_dir)
-            found += self._of_rung(rung, cfgs[chosen])
+            cfg = deepcopy(cfgs[chosen])
+            for setting in filter(_is_value, rung):
+                key, _, value = setting.partition("=")
+                group, _, name = key.partition(".")
+                cfg[group][name] = yaml.safe_load(value)
+            made = config.target(cfg, "curriculum")()
+            for less in ({}, *self.less_given):
+                own = deepcopy(cfg)
+                own.protocol.update(less)
+                settings = (*rung, *(f"protocol.{key}={value}" for key, value in less.items()))
+                found.append(Variant(settings, _in_words(rung), with_changes(made, own)))
         return tuple(found)
 
     @cached_property
@@ -120,19 +130,6 @@ class Track:
     def variant_of(self, curriculum: Curriculum) -> Variant | None:
         """Return the variant with this curriculum, if any."""
         return self.by_fingerprint.get(curriculum.fingerprint)
-
-    def _of_rung(self, rung: Sequence[str], composed: Any) -> Iterator[Variant]:
-        cfg = deepcopy(composed)
-        for setting in filter(_is_value, rung):
-            key, _, value = setting.partition("=")
-            group, _, name = key.partition(".")
-            cfg[group][name] = yaml.safe_load(value)
-        made = config.target(cfg, "curriculum")()
-        for less in ({}, *self.less_given):
-            own = deepcopy(cfg)
-            own.protocol.update(less)
-            settings = (*rung, *(f"protocol.{key}={value}" for key, value in less.items()))
-            yield Variant(settings, _in_words(rung), with_changes(made, own))
 
 
 def drawn(text: str, most: int) -> int:

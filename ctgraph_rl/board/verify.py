@@ -13,8 +13,7 @@ import math
 import secrets
 import signal
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from datetime import timedelta
 from functools import partial
 from inspect import unwrap
@@ -270,20 +269,15 @@ def verify(submission: Submission, arguments: argparse.Namespace) -> list[Check]
     plan = planned(submission, arguments)
     ask(describe_plan(plan), arguments.yes)
     message = f"interrupted, and no process is left; with --number {plan.number} the same command resumes"
-    with locked(plan.cells[0].folder.parents[1]), _ended_by_signals(message):
-        checks += run_plan(plan)
+    with locked(plan.cells[0].folder.parents[1]):
+        try:
+            with sigterm_exits():
+                checks += run_plan(plan)
+        except (KeyboardInterrupt, SystemExit) as error:
+            print(f"\n{message}", file=sys.stderr)
+            sys.exit(error.code if isinstance(error, SystemExit) else 128 + signal.SIGINT)
     write_verification(submission, checks, plan)
     return checks
-
-
-@contextmanager
-def _ended_by_signals(message: str) -> Iterator[None]:
-    try:
-        with sigterm_exits():
-            yield
-    except (KeyboardInterrupt, SystemExit) as error:
-        print(f"\n{message}", file=sys.stderr)
-        sys.exit(error.code if isinstance(error, SystemExit) else 128 + signal.SIGINT)
 
 
 def _check(arguments: argparse.Namespace) -> None:

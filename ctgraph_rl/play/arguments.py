@@ -61,9 +61,13 @@ def select(arguments: argparse.Namespace) -> Selection:
     changes |= {"fully_observable": False} if arguments.surjective else {}
     if arguments.run is not None:
         require((arguments.name is None and not changes, "--run names the curriculum: choose its task with --task"))
-        return _select_of_run(arguments.run, arguments.task)
-    policy = None if arguments.policy is None else POLICIES[arguments.policy]
-    return _select_task(arguments.name, arguments.task, changes, arguments.config_dir)._replace(policy=policy)
+        trained = load(arguments.run)
+        selection = _select_of_curriculum(trained.curriculum, arguments.task)
+        policy = trained.policy_for(selection.task)
+        initial_state = trained.agent.initial_state
+        return selection._replace(policy=policy, initial_state=initial_state, curriculum=trained.curriculum)
+    selection = _select_task(arguments.name, arguments.task, changes, arguments.config_dir)
+    return selection if arguments.policy is None else selection._replace(policy=POLICIES[arguments.policy])
 
 
 def _select_task(name: str | None, number: int, changes: NamedValues, config_dir: Path | None) -> Selection:
@@ -90,11 +94,3 @@ def _select_of_curriculum(curriculum: Curriculum, number: int) -> Selection:
     require((is_int(number, 1, len(tasks)), rule))
     (task,) = ct_graphs([tasks[number - 1]], "a drawing or a game")
     return Selection(task, f"{curriculum.name}, task {number}: {labels[number - 1]}")
-
-
-def _select_of_run(run: Path, number: int) -> Selection:
-    trained = load(run)
-    selection = _select_of_curriculum(trained.curriculum, number)
-    policy = trained.policy_for(selection.task)
-    initial_state = trained.agent.initial_state
-    return selection._replace(policy=policy, initial_state=initial_state, curriculum=trained.curriculum)

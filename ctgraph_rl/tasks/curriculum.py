@@ -256,7 +256,7 @@ class Curriculum:
             ValueError: names file and key: an unreadable or too large file, another fingerprint than stated, missing or
                 unknown keys, or values out of range.
         """
-        return read_curriculum(path_or_dict, _of_blocks)
+        return read_curriculum(path_or_dict, Curriculum, Stream)
 
     @cached_property
     def fingerprint(self) -> str:
@@ -372,13 +372,6 @@ class Stream(Curriculum):
         require((is_int(count, 1, len(self.blocks)), f"count must be in 1..{len(self.blocks)}, got {count!r}"))
         name = f"{self.name}_first_{count}"
         return Curriculum(name, self.version, self.source, self.blocks[:count], self.evaluation, protocol=self.protocol)
-
-
-def _of_blocks(
-    name: str, version: int, source: str, blocks: Any, evaluation: Evaluation, *, protocol: Protocol
-) -> Curriculum:
-    kind = Stream if isinstance(blocks, Life) else Curriculum
-    return kind(name, version, source, blocks, evaluation, protocol=protocol)
 
 
 def _some(names: Sequence[str], between: str = ", ") -> str:

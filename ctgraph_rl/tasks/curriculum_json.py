@@ -120,8 +120,10 @@ def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = 
     return content
 
 
-def read_curriculum(path_or_dict: str | PathLike[str] | ReadOnlyValues, make: Callable[..., Curriculum]) -> Curriculum:
-    """Return the curriculum, built by ``make``, of a JSON file or its content."""
+def read_curriculum(
+    path_or_dict: str | PathLike[str] | ReadOnlyValues, kind: type[Curriculum], of_life: type[Curriculum]
+) -> Curriculum:
+    """Return the curriculum of a JSON file or its content, of one class or that for a life."""
     source, content = json_object(path_or_dict, "curriculum", MAX_BYTES, MAX_NESTING)  # `_check_form` knows numbers
     content = dict(content)
     content.pop(_DERIVED, None)
@@ -136,6 +138,7 @@ def read_curriculum(path_or_dict: str | PathLike[str] | ReadOnlyValues, make: Ca
         tasks = _each("tasks", content["tasks"], _task)
         blocks: Any = content["blocks"]
         if isinstance(blocks, Mapping):
+            kind = of_life
             with within("blocks"):
                 blocks = _chosen((Life,), blocks, tasks)
         else:
@@ -145,7 +148,7 @@ def read_curriculum(path_or_dict: str | PathLike[str] | ReadOnlyValues, make: Ca
         with within("protocol"):
             protocol = _built(Protocol, content["protocol"])
         name = content["name"]
-        curriculum = make(name, content["version"], content["source"], blocks, evaluation, protocol=protocol)
+        curriculum = kind(name, content["version"], content["source"], blocks, evaluation, protocol=protocol)
         stated = content["fingerprint"]
         found = curriculum.fingerprint
         fix = f"if the change is intended, write {found!r} there, and a new version and name"

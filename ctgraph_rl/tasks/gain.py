@@ -77,12 +77,9 @@ def lost_by_policies(task: Task, num_frames: int) -> dict[str, Lost]:
     except ValueError:  # not a needle, so the other two have no closed form
         return found
     length = task.graph.expected_episode_length + task.extra_end_step
-    failures = _failed_searches(task.graph.num_end_states, num_frames / length)
+    num_goals = task.graph.num_end_states
+    tried = min(num_frames / length, num_goals)
+    failures = tried - tried * (tried + 1) / (2 * num_goals)
     found["memoryless"] = lost(ceiling, length)
     found["search"] = Lost(failures * task.goal_reward, failures * task.goal_reward)
     return found
-
-
-def _failed_searches(num_goals: int, num_episodes: float) -> float:
-    tried = min(num_episodes, num_goals)
-    return tried - tried * (tried + 1) / (2 * num_goals)

@@ -228,26 +228,29 @@ class _Draws:
     def _draw(self) -> None:
         life = self.life
         place = len(self._origins)
+        origin = place
         if life.order == "returning" and place >= life.lag and self._source.random() < life.share:
             before = place - life.lag
-            self._add(self._choices[before], self._images[before], self._origins[before])
-        elif place == 0:
-            self._add(self._below(len(life.choices)), self._new_image(), 0)
-        elif life.order == "similar":
-            other = (self._choices[-1] + 1 + self._below(len(life.choices) - 1)) % len(life.choices)
-            self._add(other, self._images[-1], place)
-        elif life.order == "conflicting":
-            others = self.neighbours[self._choices[-1]]
-            self._add(others[self._below(len(others))], self._images[-1], place)
-        elif life.order == "drifting":
-            others = self.neighbours[self._choices[-1]]
-            depth = len(life.choices[self._choices[-1]].goal)
-            if others and self._below(depth + 1):
-                self._add(others[self._below(len(others))], self._images[-1], place)
-            else:
-                self._add(self._choices[-1], self._new_image(), place)
+            choice = self._choices[before]
+            image = self._images[before]
+            origin = self._origins[before]
+        elif place == 0 or life.order in ("dissimilar", "returning"):
+            choice = self._below(len(life.choices))
+            image = self._new_image()
         else:
-            self._add(self._below(len(life.choices)), self._new_image(), place)
+            last = self._choices[-1]
+            others = self.neighbours.get(last, ())
+            choice = last
+            image = self._images[-1]
+            if life.order == "similar":
+                choice = (last + 1 + self._below(len(life.choices) - 1)) % len(life.choices)
+            elif life.order == "conflicting" or (others and self._below(len(life.choices[last].goal) + 1)):
+                choice = others[self._below(len(others))]
+            else:
+                image = self._new_image()
+        self._choices.append(choice)
+        self._images.append(image)
+        self._origins.append(origin)
 
     def _new_image(self) -> int:
         known = self.life.image_seeds
@@ -255,8 +258,3 @@ class _Draws:
             return self._below(IMAGE_SEEDS)
         last = known.index(self._images[-1]) if self._images else self._below(len(known))
         return known[(last + 1 + self._below(max(len(known) - 1, 1))) % len(known)]
-
-    def _add(self, choice: int, image: int, origin: int) -> None:
-        self._choices.append(choice)
-        self._images.append(image)
-        self._origins.append(origin)

@@ -103,7 +103,10 @@ def transition_entropy(task: Task, policy: str = "navigation", informed: bool = 
     visits = _visits(task.graph, waits, decides)
     count = _count(visits)
     steps = 1 + count[StateType.WAIT] + count[StateType.DECISION]
-    bits = {kind: _drawn_bits(task, kind) for kind in StateType}
+    bits = {}
+    for kind in StateType:
+        first, last = (0, 0) if x.is_unique(kind) else x.ids(kind)
+        bits[kind] = math.log2(1 + last - first)
     if not informed:
         return _pair_bits(visits, bits, task, _branches(task.graph, policy)) / steps
     wait = bits[StateType.WAIT]
@@ -115,13 +118,6 @@ def transition_entropy(task: Task, policy: str = "navigation", informed: bool = 
         onward = bits[StateType.END if level == task.graph.depth else StateType.DECISION]
         total += v * (waits * (stay + (1 - p) * onward) + (1 - waits) * fail)
     return total / steps
-
-
-def _drawn_bits(task: Task, kind: StateType) -> float:
-    if task.observations.is_unique(kind):
-        return 0.0
-    first, last = task.observations.ids(kind)
-    return math.log2(1 + last - first)
 
 
 def _pair_bits(visits: VisitsByLevel, bits: Mapping[StateType, float], task: Task, branches: int) -> float:

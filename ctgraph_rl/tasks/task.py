@@ -193,21 +193,23 @@ class Task:
         pair = isinstance(change, tuple) and len(change) == 2 and is_int(change[0], 1, MAX_EPISODES)
         lasts = change is None or (pair and is_int(change[1], change[0], MAX_EPISODES))
         cues = not cue or is_real(self.goal_reward, SMALLEST_CUED_REWARD)
+        rewards = []
+        for name in REWARDS:
+            value = getattr(self, name)
+            holds = is_real(value, -LARGEST_REWARD, LARGEST_REWARD)
+            rewards.append((holds, f"{name} must be a finite number, got {value!r}; at most 1e30 in size"))
+        multiplies = isinstance(self.reward_noise, str) and self.reward_noise == "multiplicative"
+        products = multiplies and is_real(self.goal_reward) and is_real(self.reward_std)
+        finite = not products or abs(self.goal_reward * self.reward_std) <= LARGEST_REWARD
         return [
-            *(_reward_rule(name, getattr(self, name)) for name in REWARDS),
+            *rewards,
             *true_or_false(extra_end_step=self.extra_end_step, legacy_goal_change=self.legacy_goal_change),
             (is_real(self.reward_std, 0), f"reward_std must be >= 0, got {self.reward_std!r}"),
-            (self._noise_is_finite(), f"goal_reward times reward_std must be at most {LARGEST_REWARD:g} in size"),
+            (finite, f"goal_reward times reward_std must be at most {LARGEST_REWARD:g} in size"),
             *one_of(NOISES, reward_noise=self.reward_noise),
             (lasts, f"goal_change must be (first, last) with 1 <= first <= last <= 2**31, got {change!r}"),
             (cues, f"reward_cue needs goal_reward > 0, got {self.goal_reward!r}"),
         ]
-
-    def _noise_is_finite(self) -> bool:
-        multiplicative = isinstance(self.reward_noise, str) and self.reward_noise == "multiplicative"
-        if not multiplicative or not (is_real(self.goal_reward) and is_real(self.reward_std)):
-            return True
-        return abs(self.goal_reward * self.reward_std) <= LARGEST_REWARD
 
     def _goal_rule(self, given: object) -> Rule:
         b = self.graph.branching_factor
@@ -345,8 +347,3 @@ def ct_graphs(tasks: Sequence[TaskLike], what: str) -> Sequence[Task]:
     """
     require((are_graphs(tasks), f"{what} needs CT-graphs, not {type(tasks[0]).__name__}; take another curriculum"))
     return tasks  # type: ignore[return-value]
-
-
-def _reward_rule(name: str, value: object) -> Rule:
-    holds = is_real(value, -LARGEST_REWARD, LARGEST_REWARD)
-    return holds, f"{name} must be a finite number, got {value!r}; at most 1e30 in size"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from ctgraph_rl.log.scores import optimal_values
@@ -92,12 +92,11 @@ def _one_policy(tasks: Sequence[Task], protocol: Protocol) -> float | None:
     for task in tasks:
         shown = (task.images, task.observations, task.graph.branching_factor, task.graph.wait_prob)
         groups.setdefault(shown, []).append(task.goal_decisions)
-    return sum(map(_most_reached, groups.values())) / len(tasks) * tasks[0].goal_reward
-
-
-def _most_reached(goals: Iterable[tuple[int, ...]]) -> int:
-    counts = Counter(goals)
-    return max(sum(n for goal, n in counts.items() if path[: len(goal)] == goal) for path in counts)
+    reached = 0
+    for goals in groups.values():
+        counts = Counter(goals)
+        reached += max(sum(n for goal, n in counts.items() if path[: len(goal)] == goal) for path in counts)
+    return reached / len(tasks) * tasks[0].goal_reward
 
 
 def _search(tasks: Sequence[Task], episodes: int) -> float | None:

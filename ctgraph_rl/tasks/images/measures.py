@@ -37,10 +37,16 @@ def distances(images: Tensor, groups: Sequence[int]) -> Distances:
         (numbers == list(range(len(numbers))), f"groups must be numbered from 0 without a gap, got {numbers}"),
     )
     group_of = torch.tensor(groups, device=images.device, dtype=torch.int64)
-    up_to = torch.stack([_counts_up_to_level(images[group_of == group]) for group in numbers]).to(torch.float64)
+    count = images[0].numel()
+    counts = []
+    for group in numbers:
+        pixels = images[group_of == group].flatten(1).to(torch.int64)
+        place = pixels + 256 * torch.arange(count, device=images.device)
+        counts.append(torch.bincount(place.flatten(), minlength=256 * count).view(count, 256).cumsum(1).flatten())
+    up_to = torch.stack(counts).to(torch.float64)
     sizes = torch.bincount(group_of).to(torch.float64)
     mixed = up_to.sum(1).unsqueeze(1) * sizes
-    sums = (mixed + mixed.T - 2 * up_to @ up_to.T) / (images[0].numel() * WHITE)
+    sums = (mixed + mixed.T - 2 * up_to @ up_to.T) / (count * WHITE)
     pairs = sizes.unsqueeze(1) * sizes - sizes.diag()  # of different images, in both orders
     same = torch.eye(len(numbers), dtype=torch.bool, device=images.device)
 
@@ -48,13 +54,6 @@ def distances(images: Tensor, groups: Sequence[int]) -> Distances:
         return (sums[where].sum() / pairs[where].sum()).item()
 
     return Distances(mean(same), mean(~same), sums / pairs)
-
-
-def _counts_up_to_level(images: Tensor) -> Tensor:
-    pixels = images.flatten(1).to(torch.int64)
-    count = pixels.shape[1]
-    place = pixels + 256 * torch.arange(count, device=images.device)
-    return torch.bincount(place.flatten(), minlength=256 * count).view(count, 256).cumsum(1).flatten()
 
 
 def count_repeats(images: Tensor) -> int:

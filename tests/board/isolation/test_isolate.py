@@ -11,6 +11,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -170,7 +171,7 @@ def test_processes_have_the_memory_together_and_no_cgroup_is_left(place, closed)
 
 def test_a_file_that_it_removed_counts_where_little_of_the_disk_stays_free(place, closed, monkeypatch):
     free = iter([10**10, 10**10, 10**8])
-    monkeypatch.setattr(isolate, "_free", lambda folder: next(free))
+    monkeypatch.setattr(isolate.shutil, "disk_usage", lambda folder: SimpleNamespace(free=next(free)))
 
     assert run(place, closed, "removed").stopped == "less than 1,000,000,000 bytes of the disk stay free"
 
