@@ -40,7 +40,12 @@ SECONDS_OF_A_MEAN = 2e-3
 SECONDS_OF_A_STEP, SECONDS_OF_A_ROW = 5e-3, 1.3e-5
 """Time of this agent's evaluation step: in all, and per parallel episode."""
 
-OF_A_LIFE = "the present task, and at block ends of the next one and those 1, 10 and 100 blocks before"
+OF_A_LIFE = {
+    "seen": "the present task, and at block ends of the next one and those 1, 10 and 100 blocks before",
+    "all": "the present task and those 1, 10 and 100 blocks before, and at block ends of the next one",
+}
+
+OF_TASKS = {"seen": "each of the tasks seen so far", "all": "each of all tasks"}
 
 MOST_SHOWN = 20
 
@@ -119,7 +124,6 @@ def describe(curriculum: Curriculum, frames_per_second: float | None = None) -> 
 
 
 def _overview(curriculum: Curriculum, frames_per_second: float | None) -> Sheet:
-    seen = OF_A_LIFE if isinstance(curriculum, Stream) else "the tasks seen so far"
     rows = {
         "version": str(curriculum.version),
         "fingerprint": curriculum.fingerprint,
@@ -128,7 +132,7 @@ def _overview(curriculum: Curriculum, frames_per_second: float | None) -> Sheet:
         "tasks": f"{len(curriculum.tasks):,}",
         "frames": f"{curriculum.num_frames:,}",
         "protocol": protocol_in_words(curriculum.protocol, len(curriculum.tasks)),
-        "evaluation": evaluation_in_words(curriculum.evaluation, seen),
+        "evaluation": evaluation_in_words(curriculum.evaluation, isinstance(curriculum, Stream)),
     }
     if isinstance(curriculum, Stream):
         rows["neighbours"] = _neighbours(curriculum)
@@ -167,8 +171,9 @@ def _time(curriculum: Curriculum, frames_per_second: float | None) -> str:
 def _evaluation_seconds(curriculum: Curriculum) -> float:
     how = curriculum.evaluation
     if isinstance(curriculum, Stream):
-        of_a_block = 2 + len(LAGS) + (curriculum.blocks.num_frames // how.every if how.every else 0)
-        return SECONDS_OF_A_MEAN * of_a_block * len(curriculum.blocks)
+        within = curriculum.blocks.num_frames // how.every if how.every else 0
+        each = 1 + len(LAGS) * (how.tasks == "all")
+        return SECONDS_OF_A_MEAN * (2 + len(LAGS) + within * each) * len(curriculum.blocks)
     moments = how.before + (curriculum.num_frames // how.every if how.every else len(curriculum.ends))
     tasks = len(curriculum.tasks) / (2 if how.tasks == "seen" else 1) + len(how.held_out)
     rows = tasks * how.num_episodes / how.episodes_per_row
@@ -196,8 +201,8 @@ def protocol_in_words(protocol: Protocol, num_tasks: int) -> str:
     return said + guide * bool(protocol.guide_frames)
 
 
-def evaluation_in_words(evaluation: Evaluation, seen: str = "the tasks seen so far") -> str:
-    """Return an evaluation in words; ``seen`` says which tasks are, where not all."""
+def evaluation_in_words(evaluation: Evaluation, is_life: bool = False) -> str:
+    """Return an evaluation in words; ``is_life``: that of a stream."""
     how = "greedy" if evaluation.greedy else "sampled"
     in_row = f", {evaluation.episodes_per_row} in a row" if evaluation.episodes_per_row > 1 else ""
     moments = [
@@ -206,12 +211,12 @@ def evaluation_in_words(evaluation: Evaluation, seen: str = "the tasks seen so f
         *(["at block ends"] if evaluation.at_block_ends else []),
     ]
     held_out = f" and {len(evaluation.held_out)} held out" if evaluation.held_out else ""
-    which = {"all": "all tasks", "seen": seen}[evaluation.tasks]
+    which = (OF_A_LIFE if is_life else OF_TASKS)[evaluation.tasks]
     adapts = f", after {evaluation.adapt_episodes} to adapt" if evaluation.adapt_episodes else ""
     episodes = f"{evaluation.num_episodes} {how} episodes{in_row}{adapts}"
     if evaluation.exact:
         episodes = f"The exact means of {how} episodes"
-    return f"{episodes} on each of {which}{held_out}: {', '.join(moments)}."
+    return f"{episodes} on {which}{held_out}: {', '.join(moments)}."
 
 
 def _blocks(curriculum: Curriculum) -> Sheet:

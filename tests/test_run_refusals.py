@@ -76,6 +76,10 @@ REFUSED = [
         ["protocol.episodes=hidden", "agent=mohqa"],
         ["error: MOHQA needs the ends of episodes, which are hidden: set protocol.episodes=shown\n"],
     ),
+    (
+        ["curriculum=stream", "protocol.boundaries=hidden", "detector=swoks", "method=mask_ri"],
+        ["error: SWOKS labels all tasks of a curriculum, which a stream draws one by one: take Stream.first(n), or "],
+    ),
     (["protocol.episodes=none"], ["error: protocol.episodes must be one of shown, hidden, got 'none'\n"]),
     (["freeze_after=0"], ["error: freeze_after must be a share of the frames in (0, 1], such as 0.1, got 0\n"]),
     (["freeze_after=true"], ["freeze_after must be a share of the frames in (0, 1], such as 0.1, got True\n"]),

@@ -68,12 +68,12 @@ class CKARL(TaskMethod):
 
     @override
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        super().setup(agent, weights, curriculum)
         names = weights.names if self.scope == "all" else head_names(agent.policy, without="state_value")
         self.inside = [name in names for name in weights.names]
         message = f"{type(agent).__name__} has no output layer behind a trunk for scope=actor_head: set scope=all"
         require((any(self.inside), message))
         self.in_scope = weights.mask_of(names)
+        super().setup(agent, weights, curriculum)
         self.ended = self.num_pooled = 0
         own = self._within(weights.parameters)
         vector = flat(own).detach()
@@ -83,6 +83,10 @@ class CKARL(TaskMethod):
         self.own = nn.ParameterList([each.detach().clone() for each in own])
         self.alpha = nn.Parameter(vector.new_zeros(self.pool_size))
         agent.replace_optimiser(self.trainable)
+
+    @override
+    def num_kept(self, weights: Weights) -> int:
+        return int(self.in_scope.sum())
 
     @property
     def trainable(self) -> list[nn.Parameter]:

@@ -32,6 +32,10 @@ class MaskLC(Masks):
         self.betas = zero_betas(weights, self.num_ids(curriculum))
         super().setup(agent, weights, curriculum)
 
+    @override
+    def num_kept(self, weights: Weights) -> int:
+        return len(weights) + len(weights.parameters)
+
     @property
     @override
     def trainable(self) -> list[nn.Parameter]:

@@ -68,6 +68,10 @@ class PackNet(TaskMethod):
         self.in_matrices = weights.in_matrices & ~weights.in_heads
         self.in_heads = weights.in_heads
 
+    @override
+    def num_kept(self, weights: Weights) -> int:
+        return 0  # beside the output layers
+
     @torch.no_grad()
     @override
     def start_task(self, task: int | None) -> None:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
+from torch import nn
 from torchrl.envs import EnvBase
 
 from ctgraph_rl.agent import Agent
@@ -151,7 +152,8 @@ def notes(curriculum: Curriculum, agent: Agent) -> Iterator[str]:
         time = f"{count:,} tasks take about {count * SECONDS_OF_A_TASK:.0f} s to make and to write"
         yield f"{time}, besides learning and evaluations: curriculum.goals=random takes fewer"
     method = getattr(agent, "method", None)
-    kept = getattr(method, "bytes_per_task", 0)
+    parts = method.modules() if isinstance(method, nn.Module) else ()
+    kept = sum(getattr(part, "bytes_per_task", 0) for part in parts)
     if kept and isinstance(curriculum, Stream):
         whole = kept * len(curriculum.blocks)
         yield f"{type(method).__name__} keeps {kept:,} bytes for each task, {whole:,} in all, and in each checkpoint"

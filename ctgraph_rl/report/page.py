@@ -219,7 +219,7 @@ def _agent(section: Section, result: Result, gallery: Gallery) -> AgentPart:
 
 
 def _numbers(section: Section, result: Result) -> dict[str, Table]:
-    if not result.finished or len(section.labels) > MOST_NAMES:
+    if not result.finished or len(section.labels) > MOST_NAMES or "life" in section.one.about:
         return {}
     matrices = {"Mean return after each block": result.performance(), "Change by each block": result.transfer()}
     tables = {}

@@ -388,10 +388,10 @@ class Recorder:
             self.log.close()
 
     def _adapted(self, policy: Any, policy_for: Callable[[int], Any] | None, frames: int) -> Policy:
-        ids = self.curriculum.task_ids
-        shown = self.curriculum.protocol.task_id
         if policy_for is None:
             return self._adapt(policy)
+        ids = self.curriculum.task_ids
+        shown = self.curriculum.protocol.task_id
         require((shown != "hidden", "policy_for is for task ids, which are hidden in this protocol: give policy"))
         tasks = list(self._evaluator.tasks_at(frames))
         unknown = [task for task in tasks if task not in ids]

@@ -7,7 +7,7 @@ import json
 import math
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from fractions import Fraction
 from functools import cached_property
@@ -196,7 +196,7 @@ class Curriculum:
         return tuple(filter(self.moment, sorted({0, *self.ends, *within})))
 
     @property
-    def task_ids(self) -> dict[TaskLike, int]:
+    def task_ids(self) -> Mapping[TaskLike, int]:
         """The id of each of ``tasks``."""
         return dict(zip(self.tasks, self.protocol.ids(len(self.tasks)), strict=True))
 
@@ -274,14 +274,15 @@ LAGS = (1, 10, 100)
 class Stream(Curriculum):
     """A curriculum whose tasks are drawn when they are needed, up to 100,000.
 
-    Block n trains task n or, where a task returns, the task of its first block. Evaluation is of the present task, and
-    at a block's end also of the next one and of those that were trained `LAGS` blocks before.
+    Block n trains task n or, where a task returns, the task of its first block. Evaluation is of the present task; at a
+    block's end also of the next one, and of those that were trained `LAGS` blocks before. With
+    ``evaluation.tasks="all"`` these earlier ones are evaluated each time.
 
     Args:
         blocks: say how tasks are drawn.
 
     Raises:
-        ValueError: as `Curriculum`, for held-out tasks, an evaluation of all tasks, and one that blocks do not repeat.
+        ValueError: as `Curriculum`, for held-out tasks, and an evaluation that blocks do not repeat.
     """
 
     blocks: Life  # type: ignore[assignment]
@@ -293,10 +294,8 @@ class Stream(Curriculum):
         how = self.evaluation
         frames = self.blocks.num_frames
         near = f"evaluation.every={how.every} must divide num_frames={frames} of a stream's blocks, or be 0"
-        seen = "a stream evaluates its present task and some before: evaluation.tasks must be seen, got all"
         require(
             (how.every == 0 or frames % how.every == 0, near),
-            (how.tasks == "seen", seen),
             (not how.held_out, "a stream has no held_out tasks: evaluate further ones of another seed"),
         )
         self._check(True)
@@ -323,12 +322,9 @@ class Stream(Curriculum):
         return range(frames, frames * len(self.blocks) + 1, frames)
 
     @cached_property
-    def task_ids(self) -> dict[TaskLike, int]:
-        """The id of each of ``tasks``; makes them all."""
-        ids: dict[TaskLike, int] = {}
-        for task, number in zip(self.tasks, self.protocol.ids(len(self.tasks)), strict=True):
-            ids.setdefault(task, number)
-        return ids
+    def task_ids(self) -> _DrawnIds:
+        """The id of each of ``tasks``, found when it is asked for."""
+        return _DrawnIds(self)
 
     @property
     def labels(self) -> Lazy[str]:
@@ -358,8 +354,11 @@ class Stream(Curriculum):
         """Return the tasks to evaluate after ``frames`` frames, with their numbers, from 1, and labels."""
         block = self.block_at(frames)
         places = [max(block - 1, 0)]
-        if block and self.is_end(frames):
-            places += [place for place in (block, *(block - 1 - lag for lag in LAGS)) if 0 <= place < len(self.blocks)]
+        is_end = block > 0 and self.is_end(frames)
+        if is_end and block < len(self.blocks):
+            places.append(block)
+        if is_end or self.evaluation.tasks == "all":
+            places += [block - 1 - lag for lag in LAGS if lag < block]
         origins = dict.fromkeys(map(self.blocks.origin, places))
         return {self.tasks[place]: (place + 1, self.labels[place]) for place in origins}
 
@@ -372,6 +371,27 @@ class Stream(Curriculum):
         require((is_int(count, 1, len(self.blocks)), f"count must be in 1..{len(self.blocks)}, got {count!r}"))
         name = f"{self.name}_first_{count}"
         return Curriculum(name, self.version, self.source, self.blocks[:count], self.evaluation, protocol=self.protocol)
+
+
+class _DrawnIds(Mapping[TaskLike, int]):
+    def __init__(self, stream: Stream) -> None:
+        self.stream = stream
+        self.ids = stream.protocol.ids(len(stream.tasks))
+
+    def __getitem__(self, task: TaskLike) -> int:
+        try:
+            place = self.stream.tasks.index(task)
+        except ValueError as error:
+            raise KeyError(task) from error
+        return self.ids[self.stream.blocks.origin(place)]
+
+    def __iter__(self) -> Iterator[TaskLike]:
+        for place in range(len(self.ids)):
+            if self.stream.blocks.origin(place) == place:
+                yield self.stream.tasks[place]
+
+    def __len__(self) -> int:
+        return len({*map(self.stream.blocks.origin, range(len(self.ids)))})
 
 
 def _some(names: Sequence[str], between: str = ", ") -> str:

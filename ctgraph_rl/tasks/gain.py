@@ -44,20 +44,22 @@ def _surplus(task: Task, gain: float, pause: int) -> float:
     return optimal_value(replace(task, step_reward=task.step_reward - gain), 1.0) - pause * gain
 
 
-class Lost(NamedTuple):
-    """What a policy loses in a block, on average."""
+class Reached(NamedTuple):
+    """What a policy reaches in a block and loses against the best, on average."""
 
-    in_episodes: float  # of return, in finished episodes
-    in_frames: float  # of reward, in all frames
+    at_end: float  # the return of its last episode
+    in_episodes: float  # lost return, in finished episodes
+    in_frames: float  # lost reward, in all frames
 
 
-def lost_by_policies(task: Task, num_frames: int) -> dict[str, Lost]:
-    """Return what the optimal policy, a search, the best memoryless and the random policy lose in a block.
+def reached_by_policies(task: Task, num_frames: int, pause: int = 0) -> dict[str, Reached]:
+    """Return what the optimal policy, a search, the best memoryless and the random policy reach in a block.
 
     The search tries each end state once by the best way, and then returns to the goal; each block starts a new one.
 
     Args:
         num_frames: of the block. The part of an episode at its end counts as its share.
+        pause: as in `optimal_gain`.
 
     Returns:
         By name; without search and memoryless, where these have no closed form.
@@ -66,20 +68,22 @@ def lost_by_policies(task: Task, num_frames: int) -> dict[str, Lost]:
     uniform = torch.full([task.images.num_images, b + 1], 1 / (b + 1), dtype=torch.float64, device="cpu")
     [chance] = policy_measures(task, uniform.unsqueeze(0))
     best = optimal_value(task, 1.0)
-    gain = optimal_gain(task)
+    gain = optimal_gain(task, pause)
 
-    def lost(value: float, length: float) -> Lost:
-        return Lost(num_frames / length * (best - value), num_frames * (gain - value / length))
+    def reached(value: float, length: float) -> Reached:
+        num_episodes = num_frames / (length + pause)
+        return Reached(value, num_episodes * (best - value), num_frames * gain - num_episodes * value)
 
-    found = {"optimal": Lost(0.0, 0.0), "random": lost(chance.return_mean, chance.length_mean)}
+    found = {"optimal": Reached(best, 0.0, 0.0), "random": reached(chance.return_mean, chance.length_mean)}
     try:
         ceiling = memoryless_ceiling(task)
     except ValueError:  # not a needle, so the other two have no closed form
         return found
     length = task.graph.expected_episode_length + task.extra_end_step
+    found["memoryless"] = reached(ceiling, length)
     num_goals = task.graph.num_end_states
-    tried = min(num_frames / length, num_goals)
+    tried = min(num_frames / (length + pause), num_goals)
     failures = tried - tried * (tried + 1) / (2 * num_goals)
-    found["memoryless"] = lost(ceiling, length)
-    found["search"] = Lost(failures * task.goal_reward, failures * task.goal_reward)
+    missed = (1 - tried / num_goals) * task.goal_reward
+    found["search"] = Reached(best - missed, failures * task.goal_reward, failures * task.goal_reward)
     return found

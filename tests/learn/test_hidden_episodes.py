@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import torch
 from helpers.scripted import ONE, THREE, TWO, Told, counting, decide, of
-from helpers.small_agents import KINDS, made
+from helpers.small_agents import KINDS, SETTINGS, made, small
 from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 
 from baselines.methods.finetune import Finetune
+from baselines.methods.scratch import Scratch
 from ctgraph_rl import Block, CTGraphEnv, Evaluation, Protocol, Recorder, learn_curriculum, make_agent
 from ctgraph_rl.learn.collect import ENDS, collect, make_env, without_ends
 from ctgraph_rl.learn.refusals import check_episodes
@@ -161,6 +162,16 @@ def test_methods_and_detectors_that_read_episodes_are_refused(compose, group, na
 
     with pytest.raises(ValueError, match=rf"^{kind} needs the ends of episodes, which are hidden: set protocol.episo"):
         method.prepare(curriculum)
+
+
+def test_a_detector_that_reads_no_episodes_labels_tasks_whose_episodes_are_hidden(compose):
+    curriculum = of(Block(ONE, 160), Block(TWO, 160), boundaries="hidden", **ENDLESS)
+    method = made(compose, "detector", "swoks", *SETTINGS["swoks"])().labelling(Scratch())
+    agent = method.attach(small(compose, "ppo"), method.prepare(curriculum))
+
+    log = learn_curriculum(curriculum, agent)
+
+    assert {m["acted_label"] for m in log.of_kind("training")} >= {1}
 
 
 def test_a_guide_and_a_partial_step_are_refused():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from functools import partial
 from statistics import fmean
 from unittest.mock import patch
 
@@ -15,7 +16,12 @@ from helpers.stopped_runs import logs_of_equal_ends, make_agent
 from rich.console import Console
 
 import curricula
+from baselines.methods.cka_rl import CKARL
+from baselines.methods.ewc import EWC
 from baselines.methods.finetune import Finetune
+from baselines.methods.mask_lc import MaskLC
+from baselines.methods.mask_sc import MaskSC
+from baselines.methods.packnet import PackNet
 from baselines.methods.scratch import Scratch
 from ctgraph_rl import RunLog, learn_curriculum
 from ctgraph_rl.learn.refusals import notes
@@ -26,7 +32,9 @@ from ctgraph_rl.runs.config import composed
 from ctgraph_rl.runs.job import build, curriculum_of
 from ctgraph_rl.runs.read import read_run
 from ctgraph_rl.runs.train import new_agent, train
-from ctgraph_rl.tasks.gain import optimal_gain
+from ctgraph_rl.tasks.gain import optimal_gain, reached_by_policies
+
+EMBEDS = ("every", "num_samples", "buffer_size", "num_references", "num_directions", "num_quantiles")
 
 SAMPLED = {"exact": False, "num_episodes": 4}
 
@@ -163,22 +171,49 @@ def test_ids_of_a_stream_are_those_of_first_blocks():
     assert shown == [[0], [1], [0], [1], [0]]
 
 
-def test_a_method_tells_what_it_keeps_for_each_task_and_is_refused_beyond_memory():
-    life = stream(num_tasks=100, protocol={"task_id": "at_boundaries"})
-    agent = Scratch().attach(learner(life), life)
-    weights = sum(parameter.numel() for parameter in agent.agent.policy.parameters())
-    endless = stream(num_tasks=100_000, protocol={"task_id": "at_boundaries"}, num_frames=64)
+@pytest.mark.parametrize(
+    "method",
+    [
+        Scratch,
+        MaskLC,
+        partial(PackNet, 0.25),
+        partial(CKARL, "actor_head", 3, 1.0, True, 1.0),
+        partial(EWC, 1.0, False, 0.5, "policy", num_samples=8, heads="multi"),
+        partial(MaskSC, "none", 0.5, 1, **dict.fromkeys(EMBEDS, 1), embedding="lwe"),
+    ],
+)
+def test_a_method_tells_what_it_keeps_for_each_task_and_is_refused_beyond_memory(method):
+    def attached(num_tasks):
+        life = stream(num_tasks=num_tasks, protocol={"task_id": "at_boundaries"})
+        return method().attach(learner(life), life), life
+
+    def num_bytes(agent):
+        return sum(each.nbytes for each in (*agent.method.buffers(), *agent.method.parameters()))
+
+    agent, life = attached(30)
 
     (note,) = notes(life, agent)
 
-    assert (
-        note == f"Scratch keeps {4 * weights:,} bytes for each task, {400 * weights:,} in all, and in each checkpoint"
-    )
+    each = (num_bytes(agent) - num_bytes(attached(20)[0])) // 10
+    name = type(agent.method).__name__
+    assert note == f"{name} keeps {each:,} bytes for each task, {30 * each:,} in all, and in each checkpoint"
     with (
-        patch("ctgraph_rl.checks.memory_bytes", lambda: 100_000),
-        pytest.raises(ValueError, match="this machine has 100,000; use fewer tasks"),
+        patch("ctgraph_rl.checks.memory_bytes", lambda: 10_000),
+        pytest.raises(ValueError, match="this machine has 10,000; use fewer tasks"),
     ):
-        Scratch().attach(learner(life), endless)
+        attached(100_000)
+
+
+def test_similarities_of_masks_keep_an_embedding_for_each_task():
+    life = stream(protocol={"task_id": "at_boundaries"})
+    settings = dict.fromkeys(EMBEDS, 2) | {"embedding": "lwe"}
+
+    kept = [
+        MaskSC(selection, 0.5, 1, **settings).attach(learner(life), life).method.bytes_per_task
+        for selection in ("none", "similarity")
+    ]
+
+    assert kept[1] - kept[0] == 4 * 2 * (12 * 12 + 3 + 1)
 
 
 @patch("baselines.methods.method.MOST_COPIES", 3)
@@ -219,6 +254,25 @@ def test_tables_of_a_life_have_windows_in_place_of_tasks(tmp_path):
     assert "…" not in printed
     assert ">= 64.00" in printed and ">= 0.00" not in printed
     assert "adaptation frames: at least; 100% of tasks never reach 0.9" in printed
+
+
+def test_figures_of_a_life_have_the_lines_of_policies_that_do_not_learn(tmp_path):
+    pytest.importorskip("matplotlib")
+    from ctgraph_rl.report.figures.heatmaps import transfer_maps
+    from ctgraph_rl.report.figures.life_windows import life_windows
+    from ctgraph_rl.report.sections import sections
+
+    life = stream({"every": 0, "greedy": False}, num_tasks=2)
+    train(life, learner(life), tmp_path, 0, config={"agent": {"_target_": "baselines.a2c.A2C"}, "seed": 0})
+    [section] = sections([read_run(tmp_path)])
+
+    returns, _, lost, _ = life_windows(section).figure.axes
+
+    reached = reached_by_policies(life.tasks[0], 64)
+    grey = [{round(line.get_ydata()[0], 9) for line in axes.lines[2:]} for axes in (returns, lost)]
+    assert grey[0] == {round(each.at_end, 9) for each in reached.values()}
+    assert grey[1] == {round(each.in_frames / 64, 9) for each in reached.values()}
+    assert transfer_maps(section, section.results[0], None) is None
 
 
 @pytest.mark.parametrize(("most", "expected"), [(3, 1), (4, 0)])

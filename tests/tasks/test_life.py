@@ -119,6 +119,9 @@ def test_the_present_task_is_evaluated_and_at_a_blocks_end_the_next_and_earlier_
     dissimilar = stream(num_tasks=200)
     assert [number for number, _ in dissimilar.evaluated(64 * 150).values()] == [150, 151, 149, 140, 50]
     assert len(dissimilar.evaluated(64 * 200)) == 4  # no task is next
+    always = replace(dissimilar, evaluation=replace(dissimilar.evaluation, tasks="all"))
+    assert [number for number, _ in always.evaluated(64 * 149 + 8).values()] == [150, 149, 140, 50]
+    assert [number for number, _ in always.evaluated(64 * 150).values()] == [150, 151, 149, 140, 50]
 
 
 @pytest.mark.parametrize(
@@ -148,7 +151,6 @@ def test_a_value_out_of_range_is_refused(changes, message):
 @pytest.mark.parametrize(
     ("evaluation", "message"),
     [
-        ({"tasks": "all"}, "evaluation.tasks must be seen, got all"),
         ({"every": 7}, "evaluation.every=7 must divide num_frames=64"),
     ],
 )

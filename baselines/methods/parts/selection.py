@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -79,6 +80,11 @@ class TaskEmbeddings(TakesNumbers):
         self.recent: dict[str, Tensor] = {}
         """The present task's last transitions, [n, ...] each."""
 
+    def num_values(self, width: int) -> int:
+        """Return the numbers of an embedding of points with so many."""
+        points = self.num_references * width
+        return points if self.embedding == "lwe" else self.num_directions * self.num_quantiles
+
     def start_task(self) -> None:
         """Empty the buffer."""
         self.recent = {}
@@ -142,17 +148,22 @@ class SelectedMasks(MaskLC):
 
     @override
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
+        self.curriculum = curriculum
+        self.ids = curriculum.protocol.ids(len(curriculum.tasks))
+        self.num_actions = most_actions(curriculum.examples)
         super().setup(agent, weights, curriculum)
         self.generator = own_generator()
-        self.curriculum = curriculum
-        self.of_id = {number: task for task, number in curriculum.task_ids.items()}
-        self.num_actions = most_actions(curriculum.examples)
         for name in ("community", "places", "offsets"):
             self.register_buffer(name, torch.zeros(0, dtype=torch.float32, device="cpu"), persistent=False)
 
     def task_in(self, slot: int) -> TaskLike:
         """Return the task of a slot."""
-        return self.of_id[self.started[slot]]
+        return self.curriculum.tasks[self.ids.index(self.started[slot])]
+
+    @override
+    def num_kept(self, weights: Weights) -> int:
+        pixels = math.prod(self.curriculum.examples[0].observation_shape)
+        return super().num_kept(weights) + self.compares * self.embeddings.num_values(pixels + self.num_actions + 1)
 
     def choose(self) -> list[int]:
         """Return the slots of the tasks to select, among the first `num_combined`."""

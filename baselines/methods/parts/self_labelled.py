@@ -21,7 +21,7 @@ from baselines.detectors.seen import SUSPICION, Seen
 from baselines.parts.networks import sequences_of, trunk_of
 from ctgraph_rl.agent import Agent, MethodLike
 from ctgraph_rl.checks import NamedValues, require
-from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.curriculum import Curriculum, Stream
 from ctgraph_rl.tasks.kinds.task_like import most_actions
 from ctgraph_rl.tasks.protocol import Block, Protocol
 
@@ -54,7 +54,9 @@ class SelfLabelled:
         reads = getattr(self.method, "reads_tasks", "")
         room = self.num_labels(curriculum)
         wants = len(curriculum.tasks) if self.detector.is_oracle else 0
+        drawn = "labels all tasks of a curriculum, which a stream draws one by one: take Stream.first(n)"
         require(
+            (not isinstance(curriculum, Stream), f"{detector} {drawn}, or leave the detector out"),
             (
                 how.task_id == "hidden",
                 f"{detector} labels tasks itself: set protocol.task_id=hidden, got {how.task_id}",

@@ -25,8 +25,10 @@ NEGATIVE = -0.05
 NO_VALUE = (0.85, 0.85, 0.85)
 
 
-def transfer_maps(section: Section, result: Result, trees: Trees) -> CaptionedFigure:
-    """Return an agent's performance matrix and what each block changed."""
+def transfer_maps(section: Section, result: Result, trees: Trees) -> CaptionedFigure | None:
+    """Return an agent's performance matrix and what each block changed; None for a stream."""
+    if "life" in section.one.about:
+        return None
     count = len(section.labels)
     marks = "" if count <= MOST_NUMBERS else " A dash marks losses."
     intervals = f" In brackets: {INTERVAL}." if count <= MOST_INTERVALS else ""

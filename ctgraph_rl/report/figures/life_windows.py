@@ -13,7 +13,9 @@ from ctgraph_rl.report.figures.learning_curves import named
 from ctgraph_rl.report.sections import Section
 from ctgraph_rl.report.style import MOST_AGENTS, agent_style, agents_legend, panels
 from ctgraph_rl.tasks.curriculum import LAGS, Stream
-from ctgraph_rl.tasks.gain import lost_by_policies
+from ctgraph_rl.tasks.gain import reached_by_policies
+
+GREY = {"color": "0.55", "linewidth": 0.8}
 
 LINES = {"optimal": "-", "search": "-.", "memoryless": "--", "random": ":"}
 
@@ -29,11 +31,11 @@ def life_windows(section: Section) -> CaptionedFigure | None:
     if not section.finished or "life" not in section.one.about:
         return None
     shown = section.results[:MOST_AGENTS]
-    stream = curriculum_of(section.one)
+    policies = _reached(curriculum_of(section.one))
     caption = (
         "Means over windows of successive tasks; retention is the share of a task's return, from failure to optimum, "
         "that is left a number of blocks later. Lines: means over seeds, where all have a value; dots: seeds. Grey: "
-        f"what policies that do not learn lose, {', '.join(LINES)}, in closed form; each block starts a new search."
+        "what policies without learning reach and lose, in closed form; each block starts a new search."
         f"{left_out(len(section.results), MOST_AGENTS, 'agents')}"
     )
     grid = panels(len(PANELS) + 1, 2, 2.2)
@@ -44,13 +46,11 @@ def life_windows(section: Section) -> CaptionedFigure | None:
             if metric == "frame_regret":
                 rows = [_per_frame(row, section) for row in rows]
             _draw(axes, range(1, len(section.labels) + 1), rows, agent_style(position, result.agent))
+        for name, values in policies.items():
+            if metric in values:
+                axes.axhline(values[metric], zorder=0, **GREY, linestyle=LINES[name])
         axes.set(xlabel=f"window of {section.one.about['life'] // len(section.labels):,} tasks", ylabel=title)
-    if isinstance(stream, Stream):
-        lost = [lost_by_policies(task, stream.blocks.num_frames) for task in stream.examples]
-        for name, look in LINES.items():
-            if all(name in each for each in lost):
-                per_frame = fmean(each[name].in_frames for each in lost) / stream.blocks.num_frames
-                of_windows[-1].axhline(per_frame, color="0.55", linestyle=look, linewidth=0.8, zorder=0)
+    of_windows[1].set_ylim(-0.05, 1.05)
     for position, result in enumerate(shown):
         rows = [[_value(run, f"retention_{lag}") for lag in LAGS] for run in result.finished]
         _draw(last, LAGS, rows, agent_style(position, result.agent))
@@ -58,10 +58,24 @@ def life_windows(section: Section) -> CaptionedFigure | None:
     last.set_xticks(LAGS, [str(lag) for lag in LAGS])
     last.minorticks_off()
     figure = grid[0, 0].figure
-    agents_legend(
-        figure, [(named(result), agent_style(position, result.agent)) for position, result in enumerate(shown)]
-    )
+    looks = [(named(result), agent_style(position, result.agent)) for position, result in enumerate(shown)]
+    agents_legend(figure, [*looks, *((name, {**GREY, "linestyle": LINES[name]}) for name in policies)])
     return CaptionedFigure("life", "A life by windows", caption, figure)
+
+
+def _reached(stream: Any) -> dict[str, dict[str, float]]:
+    if not isinstance(stream, Stream):
+        return {}
+    frames = stream.blocks.num_frames
+    pause = int(stream.protocol.hides_episodes)
+    of_tasks = [reached_by_policies(task, frames, pause) for task in stream.examples]
+    found = {}
+    for name in LINES:
+        known = [each[name] for each in of_tasks if name in each]
+        if len(known) == len(of_tasks):
+            per_frame = fmean(each.in_frames for each in known) / frames
+            found[name] = {"window_return": fmean(each.at_end for each in known), "frame_regret": per_frame}
+    return found
 
 
 def _per_frame(row: list[float], section: Section) -> list[float]:
