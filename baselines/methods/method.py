@@ -28,6 +28,8 @@ NO_PLASTICITY = PlasticityHooks()
 MOST_COPIES = 128
 """Policies with other weights that are kept; a task beyond gets a new copy each time."""
 
+COPIES_TO_SAVE = 2
+
 
 class Method(TakesNumbers, Hooks):
     """A method that does nothing, from which others derive: fine-tuning."""
@@ -184,8 +186,9 @@ class TaskMethod(Method):
         super().setup(agent, weights, curriculum)
         self.num_tasks = self.num_ids(curriculum)
         self.bytes_per_task = 4 * self.num_kept(weights)
-        what = f"what {type(self).__name__} keeps of {self.num_tasks:,} tasks, {self.bytes_per_task:,} bytes each,"
-        require_memory(what, self.num_tasks * self.bytes_per_task, "tasks, such as curriculum.num_tasks")
+        kept = f"what {type(self).__name__} keeps of {self.num_tasks:,} tasks, {self.bytes_per_task:,} bytes each"
+        needed = (1 + COPIES_TO_SAVE) * self.num_tasks * self.bytes_per_task
+        require_memory(f"{kept}, and two copies while it is saved", needed, "tasks, such as curriculum.num_tasks")
 
     def num_kept(self, weights: Weights) -> int:
         """Return how many numbers it keeps for each task: one for each weight."""

@@ -185,23 +185,25 @@ def test_ids_of_a_stream_are_those_of_first_blocks():
 def test_a_method_tells_what_it_keeps_for_each_task_and_is_refused_beyond_memory(method):
     def attached(num_tasks):
         life = stream(num_tasks=num_tasks, protocol={"task_id": "at_boundaries"})
-        return method().attach(learner(life), life), life
+        return method().attach(learner(life), life)
 
     def num_bytes(agent):
         return sum(each.nbytes for each in (*agent.method.buffers(), *agent.method.parameters()))
 
-    agent, life = attached(30)
+    life = stream(num_tasks=30, protocol={"task_id": "at_boundaries"})
+    agent = attached(30)
+    each = (num_bytes(agent) - num_bytes(attached(20))) // 10
 
     (note,) = notes(life, agent)
 
-    each = (num_bytes(agent) - num_bytes(attached(20)[0])) // 10
     name = type(agent.method).__name__
     assert note == f"{name} keeps {each:,} bytes for each task, {30 * each:,} in all, and in each checkpoint"
+    another = learner(life)
     with (
-        patch("ctgraph_rl.checks.memory_bytes", lambda: 10_000),
-        pytest.raises(ValueError, match="this machine has 10,000; use fewer tasks"),
+        patch("ctgraph_rl.checks.memory_bytes", lambda: 90 * each),
+        pytest.raises(ValueError, match=f"need {90 * each:,} bytes, this machine has {90 * each:,}; use fewer tasks"),
     ):
-        attached(100_000)
+        method().attach(another, life)
 
 
 def test_similarities_of_masks_keep_an_embedding_for_each_task():

@@ -155,7 +155,10 @@ def test_without_labels_of_a_detector_there_is_no_figure_of_them_and_with_them_i
 @pytest.mark.parametrize(("number", "said"), [(5, True), (6, False)])
 def test_the_caption_of_a_map_tells_of_intervals_up_to_the_last_that_has_them(monkeypatch, number, said):
     monkeypatch.setattr(heatmaps, "draw_matrices", lambda section, result: None)
-    section, result = SimpleNamespace(one=SimpleNamespace(about={}), labels=("task",) * number), SimpleNamespace(agent="ppo", n=3)
+    section, result = (
+        SimpleNamespace(one=SimpleNamespace(about={}), labels=("task",) * number),
+        SimpleNamespace(agent="ppo", n=3),
+    )
 
     assert ("In brackets" in heatmaps.transfer_maps(section, result, {}).caption) == said
 
