@@ -12,7 +12,10 @@ from helpers.paths import CHECKOUT
 import curricula
 from baselines.methods.finetune import Finetune
 from ctgraph_rl import metrics
+from ctgraph_rl.core.goal import read_goal
 from ctgraph_rl.runs.job import curriculum_of
+from ctgraph_rl.tasks.configurations import CONFIGURATIONS
+from curricula.axes import all_goals
 
 README = CHECKOUT / "README.md"
 
@@ -48,6 +51,28 @@ def test_readme_is_short_and_counts_what_there_is():
     assert f"{len(curricula.names())} named, versioned curricula" in text
     assert f"{agents} agents, {cells} kinds of memory, {methods} lifelong-learning methods" in text
     assert f"{len(metrics.definitions())} metrics, and runs" in text
+
+
+def test_the_table_that_readme_links_has_the_exact_numbers_of_every_goal_of_each_configuration():
+    page = (CHECKOUT / "docs" / "explanation" / "ct_graph_in_pictures.md").read_text(encoding="utf-8")
+    assert "ct_graph_in_pictures.md#the-numbers-of-each-configuration" in README.read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (CT-.*?) \| (.*?) \| ([\d.]+) \| ([\d.]+) \| ([\d.]+) \|$", page, re.MULTILINE)
+    shown = {}
+    for names, goals, *numbers in rows:
+        for name in names.split(", "):
+            every = [task.goal for task in all_goals(CONFIGURATIONS[name]())]
+            for goal in every if goals == "all" else map(read_goal, goals.split(", ")):
+                shown[name, goal] = list(map(float, numbers))
+
+    exact = {}
+    greedy = set()
+    for name, make in CONFIGURATIONS.items():
+        for task in all_goals(make()):
+            odds, ceiling = task.graph.reward_prob_random, task.memoryless_ceiling()
+            exact[name, task.goal] = [float(f"{odds:.2g}"), ceiling, task.optimal_value(1.0)]
+            greedy.add((ceiling, task.memoryless_ceiling(deterministic=True)))
+    assert shown == exact
+    assert greedy == {(1.0, 1.0), (0.25, 0.0)} and "Greedy policies without memory have 0 in place of 0.25" in page
 
 
 def stored_by(commit: str, path: Path) -> bytes | None:
