@@ -173,8 +173,6 @@ def test_what_the_page_says_in_words_of_the_hardest_graphs_holds(names):
     assert solvers == {"AMRL-Max", "AMRL-Avg", "Backpropamine"} < {name for name in RIVALS if number(unique[name]) > 1}
     assert {name for name in RIVALS if number(unique[name]) > 1} - solvers == {"QRDQN+LSTM", "DQN (6 steps)", *LONG}
     assert "With first rewards given it holds for some rivals only" in PAGE
-    assert number(unique["PPO (no memory)"]) >= 3
-    assert "which the claim does not name, solves the graph with unique decisions, too" in PAGE
 
 
 def test_the_steps_of_batches_of_reinforce_and_a2c_are_compared_by_counts_of_seeds(names):
@@ -249,11 +247,6 @@ def test_totals_over_all_graphs_are_counted_from_the_raw_results(names):
     lost = [line for key, of in lines.items() if key[1] == "0" for line in of if line["frames_to_90"]]
     gone = [line for line in lost if float(line["greedy_return"]) < 0.9]
     assert f"Of {len(lost)} runs that solved the task at an evaluation, {len(gone)} did not after training" in after
-    parts = {f"{names[line['agent']]} " for line in gone}
-    for name in names:
-        of_agent = [[line for line in each if line["agent"] == name] for each in (gone, lost)]
-        words = f"{names[name]} {len(of_agent[0])} of {len(of_agent[1])}"
-        assert (words in after) == (f"{names[name]} " in parts)
     noisy = [line for key, of in lines.items() if key[1] == "25" for line in of]
     agents = {line["agent"] for line in noisy}
     plain = [

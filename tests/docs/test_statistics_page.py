@@ -99,9 +99,9 @@ def test_widened_bounds_cover_noisy_returns_and_bounds_of_a_mean_do_not():
 
 def test_intervals_cover_noisy_returns_from_five_seeds_on():
     kinds = ("equal, mean 1", "solve at 0.9", "solve at 0.5")
-    shares = [covered(cell) for kind in kinds for noise in ("0.01", "0.1", "0.5") for cell in cells(kind, noise)]
+    shares = [covered(cell) for kind in kinds for noise in ("0.01", "0.5") for cell in cells(kind, noise)]
 
-    assert len(shares) == 3 * 3 * 5
+    assert len(shares) == 3 * 2 * 5
     assert min(shares) >= 94
 
 

@@ -92,7 +92,7 @@ def adaptation_table() -> str:
             row = [LABELS[agent], str(len(of)), best[0]["frames"], mean_of(first, SUCCESS)]
             rows.append([*row, all_adapted(of), mean_of(missed, bounds)])
     rows.append(["*best search*", "exact", "-", best[0]["best_search"], "1.00", "0.00"])
-    head = ["agent", "seeds", "frames", "success in episode 1", "success after adaptation", "regret"]
+    head = ["agent", "seeds", "frames", "success in episode 1", "success after adaptation", "search regret"]
     return table(head, rows)
 
 

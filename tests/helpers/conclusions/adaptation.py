@@ -82,7 +82,7 @@ def _() -> bool:
     return all(against(of, ("pearl", "none"), (name, "none")).wins == 5 for name in RIVALS)
 
 
-@says("no gate differs from none with an interval on one side of 0.")
+@says("the interval of each gate's difference from `none` holds 0.")
 def _() -> bool:
     of = runs(2)
     gates = [against(of, key, (key[0], "none")).difference for key in of if key[1] != "none"]

@@ -91,17 +91,6 @@ def published(exchange: str, found: Sequence[float]) -> tuple[str, str]:
     return stated, f"{fmean(found) - value:+.1f} [{low:+.1f}, {high:+.1f}]"
 
 
-def verdicts() -> str:
-    """Return which intervals of differences from the published sums include 0."""
-    lines = []
-    for exchange, name in NAMES.items():
-        found = sums(exchange, ALL)
-        low, high = welch(found, *SUMS[exchange])
-        verdict = f"{'includes' if low <= 0 <= high else 'excludes'} 0, and is {high - low:.1f} wide"
-        lines.append(f"- {name}, {len(found)} seeds: the interval of the difference {verdict}.")
-    return "\n".join(lines)
-
-
 def never(exchange: str) -> str:
     """Return the tasks, among 28 members, whose final return is below 0.5 in each seed."""
     of = groups(blocks(exchange, ALL), "task", "member")
@@ -151,7 +140,6 @@ def texts() -> dict[str, str]:
     found = {
         "mosaic": returns_table(),
         "mosaic_sums": sums_table(),
-        "mosaic_verdicts": verdicts(),
         "never_shared": never("mosaic"),
         "never_any": never("mosaic_no_similarity"),
     }
