@@ -11,7 +11,7 @@ from argparse import ArgumentParser, _SubParsersAction
 from collections.abc import Iterator
 from unittest import mock
 
-from yaml_settings import Setting, escaped, first_comment, names_in, settings_of, table
+from yaml_settings import escaped, first_comment, names_in, settings_of, table
 
 from ctgraph_rl import cli
 
@@ -43,10 +43,11 @@ def _helps(name: str) -> Iterator[str]:
         yield _block(_printed([*name.split(), "--help"]))
         return
     yield _block(parser.format_help())
+    prog = parser.prog.replace("python -m curricula", "ctgraph-rl curricula")
     for action in parser._actions:
         if isinstance(action, _SubParsersAction):
             for word, each in action.choices.items():
-                yield f"### `{_plain(parser.prog)} {word}`\n\n{_block(each.format_help())}"
+                yield f"### `{prog} {word}`\n\n{_block(each.format_help())}"
 
 
 def _parser(name: str) -> ArgumentParser | None:
@@ -79,10 +80,6 @@ def narrow() -> Iterator[None]:
         yield
 
 
-def _plain(prog: str) -> str:
-    return prog.replace("python -m curricula", "ctgraph-rl curricula")
-
-
 def _block(text: str) -> str:
     plain = re.sub(r"\x1b\[[0-9;]*m", "", text).strip()
     return f"```text\n{plain}\n```"
@@ -95,15 +92,11 @@ def _settings() -> str:
         "Every setting of a run, with its default. `KEY=VALUE` on the command line changes one. Those of "
         "[agents](agents/index.md) (`agent.KEY`), [methods](methods/index.md) (`method.KEY`) and "
         "[curricula](curricula/index.md) (`curriculum.KEY`) are on their cards.",
-        table(_of_run()),
+        table([setting for setting in settings_of("config") if not setting.key.startswith("hydra.")]),
     ]
     for group, (title, words) in GROUPS.items():
         parts += [f"## {title}", words, *(_file(group, name) for name in names_in(group))]
     return "\n\n".join(parts) + "\n"
-
-
-def _of_run() -> list[Setting]:
-    return [setting for setting in settings_of("config") if not setting.key.startswith("hydra.")]
 
 
 def _file(group: str, name: str) -> str:

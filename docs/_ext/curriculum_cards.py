@@ -83,7 +83,7 @@ def card(curriculum: Curriculum, graphs: str = "", similarity: str = "", curves:
         "[All curricula](index.md)",
         _purpose(name),
         *([f"![The graphs of {name}, and where the goals are](../figures/{graphs})"] if graphs else []),
-        _facts(overview),
+        to_markdown(overview).split("\n\n", 1)[1].strip(),  # without its title
         f"```bash\nctgraph-rl curriculum={name}\n```",
         f'```python\nimport curricula\n\ncurriculum = curricula.load("{name}")\n```',
         *(_of_graphs(curriculum, similarity) if are_graphs(curriculum.tasks) else []),
@@ -108,11 +108,6 @@ def _of_graphs(curriculum: Curriculum, similarity: str) -> list[str]:
     ]
 
 
-def _facts(overview: Sheet) -> str:
-    """Return the first table of the description, without its title."""
-    return to_markdown(overview).split("\n\n", 1)[1].strip()
-
-
 def _folded(sheets: list[Sheet], tasks: int) -> list[str]:
     """Return the other tables of the description, folded where they are long."""
     tables = [to_markdown(sheet).strip() for sheet in sheets]
@@ -133,10 +128,11 @@ def _who(curriculum: Curriculum) -> Iterator[str]:
     yield _of_memory(curriculum.tasks)
     hardest = max(curriculum.tasks, key=random_frames_to_goal)
     frames, longest = random_frames_to_goal(hardest), max(block.num_frames for block in curriculum.blocks)
+    needed = f"{frames:,.0f}" if frames < 1e7 else f"{frames:.1e}"
     label = escaped(dict(zip(curriculum.tasks, curriculum.labels, strict=True))[hardest])
     yield (
         f"Exploration: on {label}, the hardest task for it, a random policy first reaches the goal after "
-        f"{_rounded(frames)} frames on average; the longest block has {longest:,}."
+        f"{needed} frames on average; the longest block has {longest:,}."
     )
     if curriculum.protocol.task_id == "hidden" and _conflicts(curriculum.tasks):
         yield (
@@ -168,7 +164,3 @@ def _conflicts(tasks: tuple[Task, ...]) -> bool:
     return len({(t.graph, t.images, t.observations) for t in tasks}) < len(
         {(t.graph, t.images, t.observations, t.goal) for t in tasks}
     )
-
-
-def _rounded(value: float) -> str:
-    return f"{value:,.0f}" if value < 1e7 else f"{value:.1e}"

@@ -35,12 +35,13 @@ def metric_cards() -> Iterator[tuple[str, str]]:
 def _card(name: str, value: metrics.Metric | None) -> str:
     entry = metrics.METRICS[name]
     text = getdoc(entry.metric) or ""
+    bounds = entry.bounds.__name__
     facts = {
         "id": f"`{entry.meaning.id}`",
         "formula": f"`{entry.meaning.formula}`",
         "source": escaped(entry.meaning.source),
         "computed from": ", ".join(f"`{each}`" for each in entry.required),
-        "bounds of a value": _bounds(entry.bounds.__name__),
+        "bounds of a value": "none" if bounds == "unbounded" else escaped(bounds.replace("_", " ")),
         "terms without a value": "left out of the mean" if entry.meaning.partial else "make the metric undefined",
     }
     rows = ["| | |", "|---|---|", *(f"| {fact} | {words} |" for fact, words in facts.items())]
@@ -53,10 +54,6 @@ def _card(name: str, value: metrics.Metric | None) -> str:
     ]
     python = f"```{{eval-rst}}\n.. autofunction:: {entry.metric.__module__}.{name}\n   :no-index:\n```"
     return "\n\n".join([*parts, *_example(value), "## In Python", python]) + "\n"
-
-
-def _bounds(name: str) -> str:
-    return "none" if name == "unbounded" else escaped(name.replace("_", " "))
 
 
 def _example(value: metrics.Metric | None) -> list[str]:

@@ -49,9 +49,10 @@ def empty(lines: Lines, table: Table) -> None:
 
 def write_changed(tables: Sequence[Table], change: Callable[[Lines, Table], None], folder: Path) -> None:
     """Write the stored tables to a folder with a change."""
-    from studies import raw
-
-    lines = {table.name: raw.read(table.name, FOLDER) for table in tables}
+    lines = {}
+    for table in tables:
+        with open(FOLDER / f"{table.name}.csv", newline="", encoding="utf-8") as file:
+            lines[table.name] = list(csv.DictReader(file))
     for table in tables:
         change(lines[table.name], table)
     for name, of in lines.items():

@@ -288,12 +288,14 @@ def stochastic_observations() -> list[Row]:
     """Fully stochastic observations are hard unless those of one kind share features."""
     rows = []
     for size in ("10", "50", "200"):
-        of = [runs("stochastic_grouped", group_size=size, within=within, frames=SHORT) for within in ("0.1", "0.3")]
-        alike, apart = (mean(lines, "tasks_learned") for lines in of)
-        gained = [value / 4 for value in differences(*of, "tasks_learned")]
-        number = f"{alike:.1f} and {apart:.1f} of 4 tasks learned"
+        alike, apart = (
+            runs("stochastic_grouped", group_size=size, within=within, frames=SHORT) for within in ("0.1", "0.3")
+        )
+        learned = [mean(lines, "tasks_learned") for lines in (alike, apart)]
+        gained = [value / 4 for value in differences(alike, apart, "tasks_learned")]
+        number = f"{learned[0]:.1f} and {learned[1]:.1f} of 4 tasks learned"
         test = f"sets of {size}, alike against unrelated, LSTM-PPO"
-        rows.append(Row("stochastic", test, number, Effect(gained, OF_SUCCESS, 1 - apart / 4)))
+        rows.append(Row("stochastic", test, number, Effect(gained, OF_SUCCESS, 1 - learned[1] / 4)))
     return rows
 
 

@@ -17,9 +17,6 @@ from ctgraph_rl.report.statistics import Estimate
 HERE = Path(__file__).resolve().parents[1]
 """Where raw results, pages and pictures are."""
 
-TEMPLATES = HERE / "templates"
-"""Pages without their tables and numbers."""
-
 Raw = list[dict[str, str]]
 
 MACHINE = ("machine", "cpu")
@@ -28,9 +25,9 @@ MACHINE = ("machine", "cpu")
 NOT_RECORDED = "not recorded"
 
 
-def read(name: str, folder: Path | None = None) -> Raw:
-    """The raw results of a table, as they are stored or in another folder; none if there are none."""
-    path = (folder or HERE) / f"{name}.csv"
+def read(name: str) -> Raw:
+    """The raw results of a table; none if there are none."""
+    path = HERE / f"{name}.csv"
     if not path.exists():
         return []
     return [dict(line) for line in _lines(path, path.stat().st_mtime_ns)]
@@ -52,7 +49,7 @@ def machines(*names: str) -> str:
 
 def fill(name: str, texts: Mapping[str, object]) -> str:
     """Return a page: its template with the texts that it names."""
-    return Template((TEMPLATES / f"{name}.md").read_text(encoding="utf-8")).substitute(texts)
+    return Template((HERE / "templates" / f"{name}.md").read_text(encoding="utf-8")).substitute(texts)
 
 
 def select(lines: Raw, **values: str) -> Raw:

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
+from statistics import fmean
 
 import numpy as np
 import torch
 
 from ctgraph_rl import metrics
 from ctgraph_rl.draw.style import new_figure, save_figure
-from ctgraph_rl.metrics import METRICS, Curves
+from ctgraph_rl.metrics import MASTERED, METRICS, Curves
 from ctgraph_rl.metrics.bounds import Known
 from studies.figures import draw_grid
 from studies.raw import Raw, groups, mean_of, read, select, shown, table
@@ -43,7 +44,6 @@ METHODS = (
 EXPERT = "expert"
 """The method of lines that have what each single-task expert of a seed gets on its own task after so many frames."""
 
-SOLVED = 0.9
 LEAST_ROOM = Fraction(1, 20)
 """What experts must leave to gain for a forward transfer: one of a task's 20 evaluations. Below it one failed
 evaluation of one run would outweigh all other tasks. Areas are compared with it as exact fractions."""
@@ -59,19 +59,6 @@ def curves(lines: Raw) -> Curves:
     values = torch.tensor([[float(line[task]) for task in tasks] for line in used], dtype=torch.float64)
     blocks, frames = (tuple(int(line[key]) for line in used) for key in ("block", "frames"))
     return Curves(values, blocks, frames, tuple((task,) for task in range(len(tasks))))
-
-
-def scores(lines: Raw) -> dict[str, float | None]:
-    """The numbers of the table that a run has without experts; None where there is none."""
-    run = curves(lines)
-    found = {
-        "average performance": metrics.continual_world_performance(run),
-        "forgetting": metrics.continual_world_forgetting(run),
-        "TPOT": metrics.total_performance_over_time(run),
-        "tasks learned": metrics.tasks_learned(run, SOLVED),
-    }
-    values = {name: metric.value for name, metric in found.items()}
-    return {**values, "known at the end": float((run.performance[-1] >= SOLVED).sum())}
 
 
 def areas(runs: Iterable[Raw]) -> np.ndarray:
@@ -106,15 +93,22 @@ def transfer(runs: np.ndarray, experts: np.ndarray, left_out: Sequence[int]) -> 
     return shown(two_groups(runs[:, kept], experts[:, kept], forward_transfer, RETURNS))
 
 
-COLUMNS = {
-    "average performance": "continual_world_performance",
-    "forward transfer": "",
-    "forgetting": "continual_world_forgetting",
-    "TPOT": "total_performance_over_time",
-    "tasks learned": "tasks_learned",
-    "known at the end": "tasks_learned",
+OF_A_RUN = {
+    "average performance": metrics.continual_world_performance,
+    "forgetting": metrics.continual_world_forgetting,
+    "TPOT": metrics.total_performance_over_time,
+    "tasks learned": metrics.tasks_learned,
 }
-"""Columns with the metrics that say their bounds; forward transfer also needs the experts."""
+"""Columns that a run has without experts, and the metrics that they are."""
+
+COLUMNS = ("average performance", "forward transfer", "forgetting", "TPOT", "tasks learned", "known at the end")
+
+
+def scores(lines: Raw) -> dict[str, float | None]:
+    """The numbers of the table that a run has without experts; None where there is none."""
+    run = curves(lines)
+    values = {name: metric(run).value for name, metric in OF_A_RUN.items()}
+    return {**values, "known at the end": float((run.performance[-1] >= MASTERED).sum())}
 
 
 def summary(name: str) -> str:
@@ -126,24 +120,16 @@ def summary(name: str) -> str:
     for method in MASK_METHODS:
         runs = list(groups(select(read(name), method=method), "seed").values())
         found = [scores(lines) for lines in runs]
-        row = [f"`{method}`"]
-        for column, metric in COLUMNS.items():
-            if metric:
-                row.append(mean_of([each[column] for each in found], bounds(metric, runs[0])))
-            else:
-                row.append(transfer(areas(runs), alone, left_out))
-        rows.append(row)
-    tasks = f"task {', '.join(map(str, left_out))}" if left_out else "none"
+        evaluations, tasks = curves(runs[0]).performance.shape
+        known = Known(*RETURNS, tasks=tasks, evaluations=evaluations, lowest_share=0.0, highest_share=1.0)
+        cells = {"forward transfer": transfer(areas(runs), alone, left_out)}
+        for column in found[0]:
+            metric = OF_A_RUN.get(column, metrics.tasks_learned)
+            cells[column] = mean_of([each[column] for each in found], METRICS[metric.__name__].bounds(known))
+        rows.append([f"`{method}`", *(cells[column] for column in COLUMNS)])
+    names = f"task {', '.join(map(str, left_out))}" if left_out else "none"
     seeds = f"{len(experts)} seeds of each method and of the experts."
-    return f"{table(['method', *COLUMNS], rows)}\n\n{seeds} Left out of forward transfer: {tasks}."
-
-
-def bounds(metric: str, lines: Raw) -> tuple[float, float]:
-    """The lowest and the highest value of a metric."""
-    run = curves(lines)
-    evaluations, tasks = run.performance.shape
-    known = Known(*RETURNS, tasks=tasks, evaluations=evaluations, lowest_share=0.0, highest_share=1.0)
-    return METRICS[metric].bounds(known)
+    return f"{table(['method', *COLUMNS], rows)}\n\n{seeds} Left out of forward transfer: {names}."
 
 
 def returns_at_end(lines: Raw) -> list[float]:
@@ -175,7 +161,7 @@ def draw_by_agent(path: Path) -> None:
     panels = figure.subplots(1, len(CURRICULA), sharey=True)
     for axes, curriculum in zip(panels, CURRICULA, strict=True):
         of = groups(select(read("methods"), curriculum=curriculum), "method", "agent")
-        rows = [[np.mean(returns_at_end(of[method, agent])) for agent in AGENTS] for method in METHODS]
+        rows = [[fmean(returns_at_end(of[method, agent])) for agent in AGENTS] for method in METHODS]
         counts = [len(groups(of[METHODS[0], agent], "seed")) for agent in AGENTS]
         agents = [f"{agent}\nn = {count}" for agent, count in zip(AGENTS, counts, strict=True)]
         draw_grid(axes, rows, "{:.2f}", METHODS, agents)

@@ -104,7 +104,7 @@ def on_images(name: str) -> Raw:
 
 def comparisons() -> dict[tuple[str, str], Comparison]:
     """Return the comparisons on the image sets, whose pairs are those of all configurations together."""
-    measured = {}
+    measured: dict[tuple[str, ...], float] = {}
     for name in {name for pair in COMPARED for name in pair}:
         for line in on_images(name):
             measured[name, line["curriculum"], line["seed"]] = float(line["average_performance"])
@@ -121,11 +121,6 @@ def page() -> str:
         "announced_less": undecided(found["announced", "oracle"]),
         "machines": machines(NAME, task_free.NAME),
     }
-    for key, name in (("swoks", "swoks, fresh"), ("adwin", "adwin"), ("oracle", "oracle")):
-        lines = on_images(name)
-        texts[f"{key}_online"] = f"{mean(numbers_in(lines, 'online_return')):.2f}"
-        texts[f"{key}_found"] = str(soon(lines))
-        texts[f"{key}_chance"] = by_chance(lines)
     return fill(NAME, texts)
 
 
