@@ -28,8 +28,7 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 class Relearning(NamedTuple):
     """What a process learns, as plain values."""
 
-    seeds: Sequence[int]
-    together: bool  # whether the seeds are trained as one batch
+    seeds: Sequence[int]  # several are trained as one batch
     config: ReadOnlyValues  # without the seed
     num_threads: int
     entry_point: str | None  # module:function of a learner that is not ours
@@ -73,7 +72,7 @@ def learn_again(job: Relearning, folder: Path) -> None:
             target = "ctgraph_rl.tasks.curriculum.Curriculum.from_json"
             settings["curriculum"] = {"_target_": target, "path_or_dict": job.curriculum}
         runs.append((configuration(settings), run_dir))
-    if job.together:
+    if len(runs) > 1:
         run_as_one(runs)
     else:
         run_job(*runs[0])

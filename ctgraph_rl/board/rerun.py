@@ -63,11 +63,6 @@ class RerunCell(NamedTuple):
     seconds: float  # that the submitted runs took
 
     @property
-    def num_frames(self) -> int:
-        """Frames of all seeds."""
-        return self.curriculum.num_frames * len(self.job.seeds)
-
-    @property
     def run_dirs(self) -> list[Path]:
         """The run directory of each seed."""
         return [run_dir_of(self.folder, seed) for seed in self.job.seeds]
@@ -115,8 +110,7 @@ def job_of(submission: Submission, seeds: tuple[int, ...], run: SubmittedRun) ->
     cores = os.cpu_count() or 1
     few = f"{run.run} had {run.num_threads} threads, this machine has {cores} cores: verify it on a larger one"
     require((entry is not None or run.num_threads <= cores, few))
-    together = bool(run.group) and len(seeds) > 1
-    return Relearning(seeds, together, submission.config, run.num_threads, entry_point=entry)
+    return Relearning(seeds, submission.config, run.num_threads, entry_point=entry)
 
 
 def learn_again(cell: RerunCell, limits: Limits, isolated: Isolation, code: Sequence[Path] = ()) -> Outcome:
@@ -277,19 +271,17 @@ def verified(submission: Submission, results: Mapping[SubmittedRun, Rerun], othe
     Bits are compared first. Where they differ and are not promised, scores are tested instead.
     """
     name = score_name(submission)
-    every: list[Check] = []
-    without_bits: list[Check] = []
+    checks: list[Check] = []
     scored: list[float | None] = []
     for run, result in results.items():
-        checks = checks_of(run, submission.log(run), result, other_bits)
-        every += checks
-        wrong = [check for check in checks if check.passed is False and check.what != BYTES]
-        if run.finished and wrong and result.log is not None and other_bits:
+        of_run = checks_of(run, submission.log(run), result, other_bits)
+        wrong = any(check.passed is False and check.what != BYTES for check in of_run)
+        if wrong and other_bits and result.log is not None:
             scored.append(score_of(result.log, submission.curriculum, name))
-            checks = [check for check in checks if check.what == BYTES]
-        without_bits += checks
+            of_run = [check for check in of_run if check.what == BYTES]
+        checks += of_run
     if not scored:
-        return every
+        return checks
     note = f"bits differ, as they may with {'; '.join(other_bits)}"
     values = [value for value in scored if value is not None]
-    return [check_of_scores(submission, values, f"{name} of {len(scored)} reruns", RERUN, note), *without_bits]
+    return [check_of_scores(submission, values, f"{name} of {len(scored)} reruns", RERUN, note), *checks]

@@ -113,7 +113,7 @@ def describe_plan(plan: Plan) -> list[str]:
     if plan.held_out:
         seeds += f"; {HELD_OUT} seeds {_seeds(plan.held_out)}"
     seconds = sum(cell.seconds for cell in cells)
-    frames = sum(cell.num_frames for cell in cells)
+    frames = sum(cell.curriculum.num_frames * len(cell.job.seeds) for cell in cells)
     limit = _time(limits_of(longest(cells), arguments).seconds)
     most = f"each at most {limit}, {arguments.memory:g} GB of memory and {arguments.disk:g} GB of disk"
     count = f"{len(cells)} process{'es' * (len(cells) > 1)}"

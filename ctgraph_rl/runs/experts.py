@@ -95,7 +95,6 @@ def find_or_train(
     tell: Callable[[str], object],
     *,
     waiting: Callable[[], object] = lambda: None,
-    only: int | None = None,
     console: Console | None = None,
 ) -> tuple[dict[int, list[Expert]], Failures]:
     """Return each seed's experts of all tasks, training those that the folder lacks.
@@ -107,7 +106,6 @@ def find_or_train(
         settings: by seed, all else that experts' numbers depend on: agent, seed, versions.
         tell: takes a line about each expert.
         waiting: called every half second while another process trains one.
-        only: the one task, from 1, whose experts are needed; None: all.
 
     Returns:
         Experts by seed, and the error of each seed with a failed expert, which has none.
@@ -118,7 +116,7 @@ def find_or_train(
     alone = {i: expert_curriculum(curriculum, task) for i, task in enumerate(curriculum.tasks, 1)}
     found: dict[int, list[Expert]] = {seed: [] for seed in settings}
     failed: Failures = {}
-    for i in alone if only is None else (only,):
+    for i in alone:
         what = f"expert {i} of {len(alone)}, {curriculum.labels[i - 1]}"
         run_dirs = {}
         for seed, experts in found.items():

@@ -163,13 +163,12 @@ def settings_of_experts(cfg: DictConfig) -> NamedValues:
 
 
 def train_experts(
-    configs: Sequence[Any], curriculum: Curriculum, interrupt: Interrupt, only: int | None = None
+    configs: Sequence[Any], curriculum: Curriculum, interrupt: Interrupt
 ) -> tuple[dict[int, list[Expert]], Failures]:
     """Find or train the single-task experts of several seeds' runs, those of a task as one batch.
 
     Args:
         interrupt: ends waiting for other processes.
-        only: the one task whose experts are needed, from 1; None: all.
 
     Returns:
         The experts of each seed; the error of each seed with an expert that failed, which has none.
@@ -205,17 +204,8 @@ def train_experts(
             deciding,
             print,
             waiting=interrupt.check,
-            only=only,
             console=console_of_runs(),
         )
-
-
-def learn_experts(configs: Sequence[Any], task: int) -> None:
-    """Find or train the single-task experts of seeds for one task, from 1, as one batch."""
-    first = configs[0]
-    prepare_torch(first)
-    with Interrupt() as interrupt:
-        train_experts(configs, curriculum_of(first, method_of(first)()), interrupt, only=task)
 
 
 @takes_numbers

@@ -193,7 +193,7 @@ def test_seeds_that_were_trained_together_are_drawn_as_their_group(tiny_submissi
 
     (cell,) = cells_of(grouped, draw(grouped, 0, 1), tmp_path)
 
-    assert (cell.job.seeds, cell.job.together, cell.runs) == ((0, 1), True, runs)
+    assert (cell.job.seeds, cell.runs) == ((0, 1), runs)
 
 
 @pytest.mark.parametrize(
@@ -245,7 +245,7 @@ def test_a_learner_that_is_not_ours_is_called_by_its_entry_point(tiny_submission
         folder = tmp_path / name
         folder.mkdir()
         path = str(tmp_path / "curriculum.json")
-        job = Relearning((3,), False, {}, 1, entry_point="waiting_learner:train", curriculum=path)
+        job = Relearning((3,), {}, 1, entry_point="waiting_learner:train", curriculum=path)
         relearn.learn_again(job, folder)
         cell = rerun.RerunCell(folder, job, (), tiny_submission.curriculum, 1.0)
         result = result_of(cell, 3, Outcome(0, None, ""))

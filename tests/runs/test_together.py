@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -24,7 +25,7 @@ from ctgraph_rl.log.provenance import NUMBERS, NUMBERS_TOGETHER, code_changes
 from ctgraph_rl.report.page import write_report
 from ctgraph_rl.report.terminal import code_notes, group_size
 from ctgraph_rl.runs import checkpoints, config, job, session
-from ctgraph_rl.runs.job import learn_experts, run_as_one
+from ctgraph_rl.runs.job import run_as_one
 from ctgraph_rl.runs.load import load
 from ctgraph_rl.runs.read import find_runs, read_run
 
@@ -385,6 +386,18 @@ def test_more_seeds_than_memory_holds_are_refused_before_they_learn(monkeypatch,
 
     said = " ".join("".join(capsys.readouterr()).split())
     assert "weights and a batch of 3 seeds need " in said and "use fewer seeds at a time" in said, said
+
+
+def learn_experts(given: list[DictConfig], task: int) -> None:
+    """Find or train the experts of one task, from 1, as one batch."""
+    job.prepare_torch(given[0])
+    curriculum = job.curriculum_of(given[0], job.method_of(given[0])())
+    one = slice(task - 1, task)
+    ids = curriculum.protocol.task_ids
+    protocol = replace(curriculum.protocol, task_ids=ids[one])
+    alone = replace(curriculum, blocks=curriculum.blocks[one], protocol=protocol)
+    with job.Interrupt() as interrupt:
+        job.train_experts(given, alone, interrupt)
 
 
 def configs(*seeds: int, folder: str = "experts") -> list[DictConfig]:
