@@ -136,19 +136,16 @@ class Native:
         if action is None or action.dtype != torch.int64 or action.shape != (n,):
             return None
         if self._shapes is None:
-            self._shapes = self._stepped_shapes()
+            shapes = []
+            for name in Stepped._fields:
+                dtype, is_image, _ = _ARRAYS[name]
+                pixels = self.params.bank.shape[1:] if is_image else ()
+                one = torch.empty((), dtype=dtype, device=self.params.row.device)
+                shapes.append(one.expand(n, *pixels))
+            self._shapes = Stepped(*shapes)
         made = Stepped(*map(torch.empty_like, self._shapes))
         after, wrong = self._run(state, most_action=most_action, restarts=True, made=made, action=action)
         return None if wrong else (after, made)
-
-    def _stepped_shapes(self) -> Stepped:
-        shapes = []
-        for name in Stepped._fields:
-            dtype, is_image, _ = _ARRAYS[name]
-            pixels = self.params.bank.shape[1:] if is_image else ()
-            one = torch.empty((), dtype=dtype, device=self.params.row.device)
-            shapes.append(one.expand(len(self.tables.entry), *pixels))
-        return Stepped(*shapes)
 
     def run(
         self,

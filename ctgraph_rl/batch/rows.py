@@ -173,11 +173,10 @@ class Rows(TakesNumbers, nn.Module):
         Raises:
             ValueError: if there is not one task per row, or a task is not in the pool.
         """
-        tasks = require_all(Task, "tasks", tasks)
-        n = self.num_rows
-        require((len(tasks) == n, f"set_tasks needs one task per row, {n} in all, got {len(tasks)}"))
-        whole_pool = torch.arange(len(self.pool), device=self.device)
         numbers = torch.tensor(find_numbers(self.pool, tasks), device=self.device, dtype=torch.int64)
+        n = self.num_rows
+        require((len(numbers) == n, f"set_tasks needs one task per row, {n} in all, got {len(numbers)}"))
+        whole_pool = torch.arange(len(self.pool), device=self.device)
         self._choose(whole_pool, numbers, None, at_episode_end)
 
     def switch_tasks(self, tasks: Iterable[Task], switch: Switch, at_episode_end: bool = False) -> None:

@@ -55,22 +55,18 @@ def verification_of(submission: Submission) -> Verification:
         return Verification("submitted")
     try:
         found = json_value(read_regular(path, MOST_BYTES))
-        _check_verification(found)
+        require((isinstance(found, dict), f"it must be an object, got {found!r:.80}"))
+        known = {name: found.get(name) for name in KINDS}
+        require(*((holds, f"its {message}") for holds, message in kind_rules(known, KINDS)))
+        stated = found["level"]
+        reached = level_of([Check(**check) for check in found["checks"]])
+        require((reached == stated, f"its checks give the level {reached}, not {stated}"))
     except (OSError, ValueError) as error:
         why = f"{VERIFICATION} counts for nothing, {error}; verify the submission again"
         return Verification("submitted", why_none=why)
     if found.get("digest") != submission.digest:
         return Verification("submitted", why_none=f"{VERIFICATION} is of other files; verify the submission again")
-    level = "failed" if found["level"] == NONE else found["level"]
-    return Verification(level, found["bits"])
-
-
-def _check_verification(given: Any) -> None:
-    require((isinstance(given, dict), f"it must be an object, got {given!r:.80}"))
-    known = {name: given.get(name) for name in KINDS}
-    require(*((holds, f"its {message}") for holds, message in kind_rules(known, KINDS)))
-    reached = level_of([Check(**check) for check in given["checks"]])
-    require((reached == given["level"], f"its checks give the level {reached}, not {given['level']}"))
+    return Verification("failed" if stated == NONE else stated, found["bits"])
 
 
 def _is_check(value: Any) -> bool:

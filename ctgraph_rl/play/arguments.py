@@ -87,7 +87,6 @@ def _name_task(name: str, task: Task) -> Selection:
 
 
 def _select_of_curriculum(curriculum: Curriculum, number: int) -> Selection:
-    ct_graphs(curriculum.examples, "a drawing or a game")
     tasks = curriculum.tasks
     labels = curriculum.labels
     rule = f"--task must be in 1..{len(tasks)}, the tasks of {curriculum.name}, got {number}"
