@@ -21,7 +21,7 @@ from ctgraph_rl.tasks.configurations import OBSERVABILITY as OBSERVABILITY
 from ctgraph_rl.tasks.configurations import observations_of
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import ImageSet, PaperImages
-from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
+from ctgraph_rl.tasks.protocol import MOST_TASKS, Block, Evaluation, Protocol, count_rule
 from ctgraph_rl.tasks.switch import Switch
 from ctgraph_rl.tasks.task import Task
 from curricula.draws import below, different, generator, shuffled
@@ -32,7 +32,7 @@ Tasks = tuple[Task, ...]
 OneOrMore = Task | Iterable[Task]
 Axis = Callable[[Tasks], Tasks]
 
-MOST_TASKS = 100_000
+MOST_TIMES = 100_000
 
 
 def as_tasks(tasks: OneOrMore) -> Tasks:
@@ -75,17 +75,20 @@ def given_goals(tasks: OneOrMore, goals: Iterable[Goal]) -> Tasks:
 def goals_sharing(tasks: OneOrMore, num_decisions: int) -> Tasks:
     """Every goal that shares its first ``num_decisions`` in 0..d with the task's own, in lexicographic order."""
 
-    def vary(task: Task) -> Iterable[Task]:
-        b = task.graph.branching_factor
+    varied = as_tasks(tasks)
+    count = 0
+    for task in varied:
         d = task.graph.depth
         require((is_int(num_decisions, 0, d), f"num_decisions must be in 0..{d}, the depth, got {num_decisions!r}"))
-        count = b ** (d - num_decisions)
-        fix = f"at most {MOST_TASKS}; use random_goals for a sample"
-        require((count <= MOST_TASKS, f"{count} tasks are too many: {fix}"))
-        ends = itertools.product(range(1, b + 1), repeat=d - num_decisions)
+        count += task.graph.branching_factor ** (d - num_decisions)
+    require(count_rule(count))
+
+    def vary(task: Task) -> Iterable[Task]:
+        branches = range(1, task.graph.branching_factor + 1)
+        ends = itertools.product(branches, repeat=task.graph.depth - num_decisions)
         return (replace(task, goal=task.goal[:num_decisions] + end) for end in ends)
 
-    return each(tasks, vary)
+    return each(varied, vary)
 
 
 @takes_numbers
@@ -372,7 +375,7 @@ def cycle(tasks: OneOrMore, times: int) -> Tasks:
 
 
 def _check_times(times: object) -> None:
-    require((is_int(times, 1, MOST_TASKS), f"times must be an integer >= 1, got {times!r}"))
+    require((is_int(times, 1, MOST_TIMES), f"times must be an integer >= 1, got {times!r}"))
 
 
 @takes_numbers

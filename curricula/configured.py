@@ -18,7 +18,7 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import OneHot
 from ctgraph_rl.tasks.observations import Observations
 from ctgraph_rl.tasks.paper_json import shown_ids
-from ctgraph_rl.tasks.protocol import Evaluation
+from ctgraph_rl.tasks.protocol import Evaluation, count_rule
 from ctgraph_rl.tasks.reference import read_task
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift
 from ctgraph_rl.tasks.task import Task
@@ -284,7 +284,12 @@ def _in_order(by_seed: Sequence[Tasks], goals: Any, num_goals: int, order: str, 
             return axes.random_goals(task, num_goals, seed)
         return axes.all_goals(task) if goals == "all" else axes.as_tasks(task)
 
-    with_goals = [list(map(with_goals_of, graphs)) for graphs in by_seed]
+    with_goals = []
+    count = 0
+    for graphs in by_seed:
+        with_goals.append(list(map(with_goals_of, graphs)))
+        count += sum(map(len, with_goals[-1]))
+        require(count_rule(count))
     sequences = [axes.concatenate(*graphs) for graphs in with_goals]
     if order == "interleave":
         return axes.interleave(*(sequences if len(sequences) > 1 else with_goals[0]))

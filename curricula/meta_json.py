@@ -20,10 +20,10 @@ from reprlib import repr as short
 from ctgraph_rl.checks import ReadOnlyValues, Rule, are_ints, is_int, require, takes_numbers
 from ctgraph_rl.strict import json_object, within
 from ctgraph_rl.tasks.curriculum import Curriculum
-from ctgraph_rl.tasks.protocol import Protocol
+from ctgraph_rl.tasks.protocol import MOST_TASKS, Protocol
 from ctgraph_rl.tasks.reference import read_task
 from ctgraph_rl.tasks.task import Task
-from curricula.axes import MOST_TASKS, sequence
+from curricula.axes import sequence
 from curricula.published import one_id_each
 
 MOST_BYTES = 4 * 2**20

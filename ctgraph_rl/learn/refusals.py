@@ -18,15 +18,12 @@ from ctgraph_rl.learn.exact import exact_rules
 from ctgraph_rl.tasks.curriculum import Curriculum, Stream
 from ctgraph_rl.tasks.task import Task
 
-MANY_TASKS = 10_000
-"""Tasks above which a run says what they take."""
-
-SECONDS_OF_A_TASK = 4e-4
-"""To make a task, its fingerprint and its JSON, on one core."""
+MOST_LINES = 2**20
+"""Most lines of evaluations in a log."""
 
 
 def check_rows(curriculum: Curriculum, num_envs: int) -> None:
-    """Refuse a curriculum whose blocks are not whole steps of ``num_envs`` rows.
+    """Refuse a curriculum whose blocks are not whole steps of ``num_envs`` rows, and too many evaluations.
 
     Raises:
         ValueError: names the block and the nearest possible frames, or the tasks that cannot share the rows.
@@ -41,6 +38,25 @@ def check_rows(curriculum: Curriculum, num_envs: int) -> None:
         numbers.append(str(number))
         rules[block.num_frames] = block.frame_rule(num_envs, f"block {', '.join(numbers)}")
     require(*rules.values())
+    check_lines(curriculum)
+
+
+def check_lines(curriculum: Curriculum) -> None:
+    """Refuse a curriculum whose evaluations write too many lines.
+
+    Raises:
+        ValueError: names the lines.
+    """
+    if isinstance(curriculum, Stream):
+        return
+    how = curriculum.evaluation
+    tasks = len(curriculum.tasks) + len(how.held_out)
+    moments = how.before + how.at_block_ends * len(curriculum.blocks)
+    moments += curriculum.num_frames // how.every if how.every else 0
+    lines = tasks * moments
+    writes = f"evaluating {tasks:,} tasks {moments:,} times writes {lines:,} lines to the log, more than {MOST_LINES:,}"
+    fix = "set evaluation.at_block_ends=false and a larger evaluation.every, or take curriculum=stream"
+    require((lines <= MOST_LINES, f"{writes}: {fix}"))
 
 
 def resumes(curriculum: Curriculum) -> bool:
@@ -147,10 +163,6 @@ def check_adaptation(curriculum: Curriculum, agent: Agent) -> None:
 
 def notes(curriculum: Curriculum, agent: Agent) -> Iterator[str]:
     """Yield what to know of a curriculum, and of an agent on it, before a run."""
-    count = len(curriculum.tasks)
-    if count > MANY_TASKS and not isinstance(curriculum, Stream):
-        time = f"{count:,} tasks take about {count * SECONDS_OF_A_TASK:.0f} s to make and to write"
-        yield f"{time}, besides learning and evaluations: curriculum.goals=random takes fewer"
     method = getattr(agent, "method", None)
     parts = method.modules() if isinstance(method, nn.Module) else ()
     kept = sum(getattr(part, "bytes_per_task", 0) for part in parts)

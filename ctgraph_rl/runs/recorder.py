@@ -27,6 +27,7 @@ from ctgraph_rl.disk import is_writable, make_folder
 from ctgraph_rl.learn.adapt import adapt
 from ctgraph_rl.learn.collect import Policy, agent_specs
 from ctgraph_rl.learn.evaluate import Evaluator, by_slices
+from ctgraph_rl.learn.refusals import check_lines
 from ctgraph_rl.log.files import CHECKPOINTS, LOG, METRICS
 from ctgraph_rl.log.provenance import code_changes, full_name
 from ctgraph_rl.log.run_log import RunLog
@@ -138,6 +139,7 @@ class Recorder:
             (writes, "overwrite, resume and logger need a run_dir"),
         )
         curriculum.evaluation.check((*curriculum.tasks, *curriculum.evaluation.held_out))
+        check_lines(curriculum)
         self.curriculum = curriculum
         self.run_dir = None if run_dir is None else as_path("run_dir", run_dir)
         self.saved: Mapping[str, Any] | None = None

@@ -28,7 +28,7 @@ from ctgraph_rl.checks import (
 from ctgraph_rl.tasks.curriculum_json import read_curriculum, type_name, write_curriculum
 from ctgraph_rl.tasks.kinds.task_like import TaskLike, are_tasks
 from ctgraph_rl.tasks.life import DrawnTasks, Lazy, Life
-from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
+from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol, count_rule
 from ctgraph_rl.tasks.task import Task, are_graphs
 
 FINGERPRINT_SCHEMA = 1
@@ -70,6 +70,7 @@ class Curriculum:
         only_blocks = isinstance(self.blocks, tuple) and bool(self.blocks)
         only_blocks = only_blocks and all(isinstance(each, Block) for each in self.blocks)
         self._check(only_blocks)
+        require(count_rule(len(self.tasks) + len(self.evaluation.held_out)))
 
     def _check(self, only_blocks: bool) -> None:
         require(

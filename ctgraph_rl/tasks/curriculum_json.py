@@ -34,7 +34,7 @@ from ctgraph_rl.tasks.kinds.task_like import TaskLike, is_kind
 from ctgraph_rl.tasks.life import Life
 from ctgraph_rl.tasks.memory import bank_bytes
 from ctgraph_rl.tasks.observations import Observations
-from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
+from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol, count_rule
 from ctgraph_rl.tasks.switch import SWITCHES
 from ctgraph_rl.tasks.task import Task
 
@@ -135,7 +135,9 @@ def read_curriculum(
         _check_keys(content, _KEYS)
         require((schema == SCHEMA, f"schema must be {SCHEMA}, got {schema!r}"))
         require((isinstance(content["source"], str), f"source must be a text, got {content['source']!r:.80}"))
-        tasks = _each("tasks", content["tasks"], _task)
+        listed = content["tasks"]
+        require(count_rule(len(listed) if isinstance(listed, list) else 0))
+        tasks = _each("tasks", listed, _task)
         blocks: Any = content["blocks"]
         if isinstance(blocks, Mapping):
             kind = of_life

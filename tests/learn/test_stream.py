@@ -275,14 +275,3 @@ def test_figures_of_a_life_have_the_lines_of_policies_that_do_not_learn(tmp_path
     assert grey[0] == {round(each.at_end, 9) for each in reached.values()}
     assert grey[1] == {round(each.in_frames / 64, 9) for each in reached.values()}
     assert transfer_maps(section, section.results[0], None) is None
-
-
-@pytest.mark.parametrize(("most", "expected"), [(3, 1), (4, 0)])
-def test_a_run_says_what_many_tasks_take(monkeypatch, most, expected):
-    monkeypatch.setattr("ctgraph_rl.learn.refusals.MANY_TASKS", most)
-    four = curricula.from_axes(num_frames=64)
-
-    said = [note for note in notes(four, None) if note.startswith("4 tasks take about 0 s")]
-
-    assert len(said) == expected
-    assert all("curriculum.goals=random" in note for note in said)

@@ -19,15 +19,21 @@ import pytest
 import torch
 
 import ctgraph_rl
+import curricula
 from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, Task, metrics
 from ctgraph_rl.describe import describe
+from ctgraph_rl.learn import refusals
 from ctgraph_rl.learn.refusals import check_rows
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.log.sums import write_metrics
 from ctgraph_rl.log.tables import write_tables
 from ctgraph_rl.metrics import Regime
 from ctgraph_rl.metrics.lifetime import theil_sen
+from ctgraph_rl.runs.recorder import Recorder
+from ctgraph_rl.tasks import protocol
 from ctgraph_rl.tasks.configurations import ct_su_b1
+from curricula import stream
+from curricula.axes import all_goals
 
 SOURCE = str(Path(ctgraph_rl.__file__).parent)
 
@@ -143,6 +149,45 @@ def test_the_metrics_of_a_run_do_not_grow_with_its_tasks(tmp_path):
         sizes.append((tmp_path / "metrics.json").stat().st_size)
 
     assert sizes[1] < 1.05 * sizes[0]
+
+
+def test_a_log_that_grows_with_the_square_of_tasks_is_refused_before_any_work(monkeypatch):
+    each = curriculum(4)
+    lines = len(logged(each).of_kind("evaluation"))
+
+    monkeypatch.setattr(refusals, "MOST_LINES", lines)
+    check_rows(each, 4)
+    Recorder(each, seed=0).close()
+
+    monkeypatch.setattr(refusals, "MOST_LINES", lines - 1)
+    message = "^evaluating 4 tasks 5 times writes 20 lines to the log, more than 19: .* curriculum=stream$"
+    with pytest.raises(ValueError, match=message):
+        check_rows(each, 4)
+    with pytest.raises(ValueError, match=message):
+        Recorder(each, seed=0)
+    check_rows(replace(each, evaluation=Evaluation(at_block_ends=False, every=each.num_frames)), 4)
+    with pytest.raises(ValueError, match="evaluating 4 tasks 11 times writes 44 lines"):
+        check_rows(replace(each, evaluation=Evaluation(at_block_ends=False, every=8)), 4)
+
+
+def test_more_tasks_than_can_be_made_at_once_are_refused_wherever_they_come_from(monkeypatch, tmp_path):
+    each = curriculum(4)
+    each.to_json(tmp_path / "four.json")
+    monkeypatch.setattr(protocol, "MOST_TASKS", 3)
+    message = (
+        "a curriculum has at most 3 tasks, here are more: curriculum.goals=random or a list takes fewer, .*=stream"
+    )
+
+    for make in (
+        lambda: replace(each, version=2),
+        lambda: Curriculum.from_json(tmp_path / "four.json"),
+        lambda: all_goals(each.tasks[0]),
+        lambda: curricula.from_axes(depth=1, image_seeds=[1, 2]),
+        lambda: curricula.from_axes(goals=[1.1, 1.2], image_seeds=[1, 2]),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make()
+    assert len(stream(num_tasks=5, depth=1).tasks) == 5
 
 
 def peak(work: Callable[[], object]) -> int:

@@ -317,7 +317,7 @@ EVALUATIONS = st.builds(
     st.booleans(),
     st.sampled_from([1, 2, 4]),
     st.just(True),
-    st.integers(0, 2**40),
+    st.just(0) | st.integers(2**32, 2**40),
     st.booleans(),
     st.sampled_from(["all", "seen"]),
 ).filter(lambda how: how.at_block_ends or how.tasks == "all")  # else nothing may ever be evaluated
