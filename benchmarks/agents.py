@@ -1,11 +1,12 @@
-"""How fast agents learn, beside Stable-Baselines3: python -m benchmarks.agents.
+"""How fast agents learn, beside Stable-Baselines3 and JAX: python -m benchmarks.agents.
 
 Every agent learns with the settings of its yaml file on 256 rows, Stable-Baselines3's with the same ones as far as it
 has them: on ctgraph_rl.sb3.SB3VecEnv, and on its make_vec_env of the single environment; and with its own defaults on
-8 rows. Every round lets each learn for a while in turn, so what slows the machine down slows all of them; frames per
-second are medians of the rounds. Then each learns with several seeds until it reaches the goal in 90 of 100 greedy
-episodes, whose time does not count. Seconds are those of one core. --cells measures only LSTM-PPO, with each cell in
-place of the LSTM. Ctrl-C ends a measurement, and prints what was measured until then.
+8 rows. JAX's PPO is that of benchmarks.jax_ppo. Every round lets each learn for a while in turn, so what slows the
+machine down slows all of them; frames per second are medians of the rounds. Then each learns with several seeds until
+it reaches the goal in 90 of 100 greedy episodes, JAX's in 0.9 of a batch's, whose time does not count. Seconds are
+those of one core. --cells measures only LSTM-PPO, with each cell in place of the LSTM. Ctrl-C ends a measurement, and
+prints what was measured until then.
 
 --device cuda measures benchmarks.agent_ladder instead.
 """
@@ -49,6 +50,7 @@ PAIRS = (
     ("lstm_ppo", "CT-SU-B1"),
     ("lstm_ppo", "CT-CO-B1"),
 )
+IN_JAX = (("ppo", "CT-FO-B1"), ("lstm_ppo", "CT-SU-B1"))
 
 
 class Learning(Protocol):
@@ -143,7 +145,7 @@ class Ours:
 
 
 def contenders(agents: list[str]) -> Iterator[Contender]:
-    """Yield everything to measure, Stable-Baselines3 if installed."""
+    """Yield everything to measure, Stable-Baselines3 and JAX if installed."""
     for name, label in PAIRS:
         if name not in agents:
             continue
@@ -154,6 +156,10 @@ def contenders(agents: list[str]) -> Iterator[Contender]:
 
             for who, way in stable.ways().items():
                 yield Contender(name, label, who, partial(stable.Stable, name, settings(name), task, way))
+        if find_spec("jax") and (name, label) in IN_JAX:
+            from benchmarks import jax_ppo  # needs JAX, which is optional
+
+            yield Contender(name, label, "JAX", partial(jax_ppo.JAX, name, settings(name), task))
 
 
 def cells(names: list[str]) -> Iterator[Contender]:
@@ -229,8 +235,10 @@ def learned(options: ladder.Options) -> list[Contender]:
     """Let agents learn as the options say, or until Ctrl-C; return them."""
     console = Console(stderr=True)
     if not find_spec("sb3_contrib"):
-        missing = "Stable-Baselines3 is missing, only ours are measured: pip install 'ctgraph_rl[benchmark]'"
+        missing = "Stable-Baselines3 is missing and not measured: pip install 'ctgraph_rl[benchmark]'"
         console.print(missing, markup=False, soft_wrap=True)
+    if not find_spec("jax"):
+        console.print("JAX is missing and not measured: pip install jax", markup=False, soft_wrap=True)
     measured = list(contenders(options.agents) if options.cells is None else cells(options.cells))
     learners = [contender.make(0) for contender in track(measured, "building", console=console)]
     for learner in learners:

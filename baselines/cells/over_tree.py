@@ -5,7 +5,7 @@ It multiplies for all histories at once where PyTorch's does each step's operati
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -22,25 +22,33 @@ Kept = tuple[Tensor, ...]
 class Gates(Protocol):
     """A step of a cell without its products, and its gradients."""
 
+    num_kept: ClassVar[int]
+    """Tensors that `step` keeps, [n, H] each."""
+
+    adds: ClassVar[bool]
+    """Whether a step reads only the sum of its two products, so that they have one gradient."""
+
     @staticmethod
-    def step(given: Tensor, carried: Tensor, before: CellState) -> tuple[CellState, Kept]:
-        """Return the next state, and what `factors` needs.
+    def step(given: Tensor, carried: Tensor, before: CellState, after: CellState, kept: CellState) -> None:
+        """Write the next state, and what `factors` needs.
 
         Args:
             given: the product of the inputs, [n, G].
-            carried: the product of the first part of the state, [n, G]; may be overwritten.
+            carried: the product of the first part of the state, [n, G]; may be overwritten by what is needed.
             before: the parts of the state, [n, H] each.
+            after: the next state, to be written.
+            kept: to be written.
         """
         ...
 
     @staticmethod
-    def factors(kept: Kept, before: CellState) -> Kept:
+    def factors(carried: Tensor, kept: CellState, before: CellState) -> CellState:
         """Return what gradients of any number of steps are multiplied by."""
         ...
 
     @staticmethod
-    def back(factors: Kept, by: CellState) -> tuple[Tensor, Tensor, CellState]:
-        """Return gradients by ``given``, ``carried`` and the state, without that through ``carried``.
+    def back(factors: CellState, by: CellState, by_given: Tensor, by_carried: Tensor) -> CellState:
+        """Write gradients by ``given`` and ``carried``; return those by the state, without that through ``carried``.
 
         Args:
             by: gradients by the parts of the next state.
@@ -51,55 +59,64 @@ class Gates(Protocol):
 class LSTMGates(Gates):
     """i, f, g and o of an LSTM with the state h and c."""
 
-    @override
-    @staticmethod
-    def step(given: Tensor, carried: Tensor, before: CellState) -> tuple[CellState, Kept]:
-        size = before[1].shape[1]
-        gates = carried.add_(given)
-        g = gates[:, 2 * size : 3 * size].tanh()
-        gates.sigmoid_()
-        i, f, _, o = gates.chunk(4, dim=1)
-        c = torch.addcmul(f * before[1], i, g)
-        squashed = c.tanh()
-        return (o * squashed, c), (gates, g, squashed)
+    num_kept = 2
+    adds = True
 
     @override
     @staticmethod
-    def factors(kept: Kept, before: CellState) -> Kept:
-        gates, g, squashed = kept
-        i, f, _, o = gates.chunk(4, dim=1)
-        slope = gates * (1 - gates)
-        slope_i, slope_f, _, slope_o = slope.chunk(4, dim=1)
-        of_g = i * (1 - g.square())
-        of_gates = torch.cat([g * slope_i, before[1] * slope_f, of_g, squashed * slope_o], dim=1)
+    def step(given: Tensor, carried: Tensor, before: CellState, after: CellState, kept: CellState) -> None:
+        g, squashed = kept
+        h, c = after
+        carried.add_(given)
+        torch.tanh(carried.chunk(4, dim=1)[2], out=g)
+        i, f, _, o = carried.sigmoid_().chunk(4, dim=1)
+        torch.addcmul(f * before[1], i, g, out=c)
+        torch.tanh(c, out=squashed)
+        torch.mul(o, squashed, out=h)
+
+    @override
+    @staticmethod
+    def factors(carried: Tensor, kept: CellState, before: CellState) -> CellState:
+        g, squashed = kept
+        i, f, _, o = carried.chunk(4, dim=1)
+        of_gates = carried * (1 - carried)
+        of_i, of_f, of_g, of_o = of_gates.chunk(4, dim=1)
+        of_i.mul_(g)
+        of_f.mul_(before[1])
+        torch.mul(i, 1 - g.square(), out=of_g)
+        of_o.mul_(squashed)
         return of_gates, o * (1 - squashed.square()), f
 
     @override
     @staticmethod
-    def back(factors: Kept, by: CellState) -> tuple[Tensor, Tensor, CellState]:
+    def back(factors: CellState, by: CellState, by_given: Tensor, by_carried: Tensor) -> CellState:
         of_gates, of_h, f = factors
         by_h, by_c = by
         by_c = torch.addcmul(by_c, by_h, of_h)
-        by_gates = torch.cat([by_c, by_c, by_c, by_h], dim=1).mul_(of_gates)
-        return by_gates, by_gates, (torch.zeros_like(by_h), by_c * f)
+        torch.cat([by_c, by_c, by_c, by_h], dim=1, out=by_carried).mul_(of_gates)
+        return torch.zeros_like(by_h), by_c * f
 
 
 class GRUGates(Gates):
     """r, z and n of a GRU with the state h."""
 
-    @override
-    @staticmethod
-    def step(given: Tensor, carried: Tensor, before: CellState) -> tuple[CellState, Kept]:
-        size = before[0].shape[1]
-        r, z = (given[:, : 2 * size] + carried[:, : 2 * size]).sigmoid().chunk(2, dim=1)
-        of_h = carried[:, 2 * size :]
-        n = torch.addcmul(given[:, 2 * size :], r, of_h).tanh()
-        return (torch.lerp(n, before[0], z),), (r, z, n, of_h)
+    num_kept = 1
+    adds = False
 
     @override
     @staticmethod
-    def factors(kept: Kept, before: CellState) -> Kept:
-        r, z, n, of_h = kept
+    def step(given: Tensor, carried: Tensor, before: CellState, after: CellState, kept: CellState) -> None:
+        [n] = kept
+        size = n.shape[1]
+        r, z = carried[:, : 2 * size].add_(given[:, : 2 * size]).sigmoid_().chunk(2, dim=1)
+        torch.tanh(torch.addcmul(given[:, 2 * size :], r, carried[:, 2 * size :]), out=n)
+        torch.lerp(n, before[0], z, out=after[0])
+
+    @override
+    @staticmethod
+    def factors(carried: Tensor, kept: CellState, before: CellState) -> CellState:
+        [n] = kept
+        r, z, of_h = carried.chunk(3, dim=1)
         of_n = (1 - z) * (1 - n.square())
         of_r = of_n * of_h * r * (1 - r)
         of_z = (before[0] - n) * z * (1 - z)
@@ -107,10 +124,12 @@ class GRUGates(Gates):
 
     @override
     @staticmethod
-    def back(factors: Kept, by: CellState) -> tuple[Tensor, Tensor, CellState]:
+    def back(factors: CellState, by: CellState, by_given: Tensor, by_carried: Tensor) -> CellState:
         of_given, of_carried, z = factors
         by_gates = torch.cat([by[0], by[0], by[0]], dim=1)
-        return by_gates * of_given, by_gates * of_carried, (by[0] * z,)
+        torch.mul(by_gates, of_given, out=by_given)
+        torch.mul(by_gates, of_carried, out=by_carried)
+        return (by[0] * z,)
 
 
 class GatedTree(NamedTuple):
@@ -148,20 +167,25 @@ class GatesOverTree(torch.autograd.Function):
         states = [torch.cat([part, part.new_empty(len(inputs), part.shape[1])]) for part in initial]
         in_order = given.index_select(0, inputs)
         turned = weight.t()
-        kept = []
-        end = tree.sizes[0]
-        for products, shorter in zip(in_order.split(tree.sizes), tree.shorter.split(tree.sizes), strict=True):
-            before = tuple(part.index_select(0, shorter) for part in states)
-            carried = before[0] @ turned if bias is None else torch.addmm(bias, before[0], turned)
-            after, of_step = gates.step(products, carried, before)
-            for part, value in zip(states, after, strict=True):
-                part[end : end + len(shorter)] = value
-            end += len(shorter)
-            kept.append(of_step)
+        carried = torch.empty_like(in_order)
+        before = [states[0].new_empty(len(inputs), weight.shape[1]) for _ in states]
+        kept = [torch.empty_like(before[0]) for _ in range(gates.num_kept)]
+        first = 0
+        for size in tree.sizes:
+            end = first + size
+            shorter = tree.shorter[first:end]
+            of_step = [torch.index_select(states[k], 0, shorter, out=part[first:end]) for k, part in enumerate(before)]
+            if bias is None:
+                product = torch.mm(of_step[0], turned, out=carried[first:end])
+            else:
+                product = torch.addmm(bias, of_step[0], turned, out=carried[first:end])
+            after = [part[tree.sizes[0] + first : tree.sizes[0] + end] for part in states]
+            gates.step(in_order[first:end], product, of_step, after, [part[first:end] for part in kept])
+            first = end
         ctx.gated = gated
-        ctx.kept = kept
         ctx.has_bias = bias is not None
-        ctx.save_for_backward(given, weight, *states)
+        ctx.num_parts = len(states)
+        ctx.save_for_backward(given, weight, carried, *before, *kept)
         return states[0][tree.sizes[0] :]
 
     @staticmethod
@@ -169,20 +193,19 @@ class GatesOverTree(torch.autograd.Function):
     def backward(ctx: Any, by_outputs: Tensor) -> tuple[Any, ...]:
         """Return the gradients by the products, the weight and the bias."""
         gates, tree, inputs = ctx.gated
-        given, weight, *states = ctx.saved_tensors
-        before = tuple(part.index_select(0, tree.shorter) for part in states)
-        kept = tuple(torch.cat(parts) for parts in zip(*ctx.kept, strict=True))
-        factors = gates.factors(kept, before)
-        by_states = [torch.zeros_like(part) for part in states]
+        given, weight, carried, *parts = ctx.saved_tensors
+        before = parts[: ctx.num_parts]
+        factors = gates.factors(carried, parts[ctx.num_parts :], before)
+        by_states = [part.new_zeros(tree.sizes[0] + len(part), part.shape[1]) for part in before]
         by_states[0][tree.sizes[0] :] = by_outputs
-        by_given = given.new_empty(len(inputs), given.shape[1])
-        by_carried = torch.empty_like(by_given)
+        by_carried = torch.empty_like(carried)
+        by_given = by_carried if gates.adds else torch.empty_like(carried)
         last = len(inputs)
         for size in reversed(tree.sizes):
             first = last - size
             by = [part[tree.sizes[0] + first : tree.sizes[0] + last] for part in by_states]
-            of_step = tuple(part[first:last] for part in factors)
-            by_given[first:last], by_carried[first:last], by_before = gates.back(of_step, by)
+            of_step = [part[first:last] for part in factors]
+            by_before = gates.back(of_step, by, by_given[first:last], by_carried[first:last])
             if first:
                 shorter = tree.shorter[first:last]
                 by_states[0].index_add_(0, shorter, torch.addmm(by_before[0], by_carried[first:last], weight))
@@ -192,4 +215,4 @@ class GatesOverTree(torch.autograd.Function):
         by_weight = by_carried.t() @ before[0]
         by_bias = by_carried.sum(dim=0) if ctx.has_bias else None
         by_products = torch.zeros_like(given).index_add_(0, inputs, by_given)
-        return None, by_products, by_weight, by_bias, *[None] * len(states)
+        return None, by_products, by_weight, by_bias, *[None] * ctx.num_parts

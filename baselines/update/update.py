@@ -300,5 +300,5 @@ def update_state(learner: Trained) -> UpdateState:
 
 def is_captured(learner: Trained) -> bool:
     """Return whether steps are CUDA graphs: on GPUs, without a method."""
-    plain = learner.capturable and type(learner.method) is Hooks and has_parts(learner.optimiser)
-    return plain and captures(next(learner.parameters()).device)
+    on_gpu = captures(learner.trainable[0].device)
+    return on_gpu and learner.capturable and type(learner.method) is Hooks and has_parts(learner.optimiser)

@@ -41,13 +41,16 @@ def distinct(values: Sequence[Tensor], most: float = 1.0) -> tuple[Tensor, Tenso
     rows = torch.arange(len(values[0]), device=values[0].device)
     if not can_branch(values[0]) or not len(rows):
         return rows, rows
-    if len(rows) > 2 * NUM_TRIED:
-        distance = len(rows) // NUM_TRIED
-        tried = _sums(_words([value[::distance] for value in values]))
-        if len(tried.unique()) >= most * len(tried):
-            return rows, rows
+    distance = max(1, len(rows) // NUM_TRIED)
+    tries = len(rows) > 2 * NUM_TRIED
+    last = _flat(values[-1])[::distance, :1]
+    if tries and len(last.unique()) >= most * len(last):
+        return rows, rows
     words = _words(values)
-    different, groups = _sums(words).unique(return_inverse=True)
+    sums = _sums(words)
+    if tries and len(sums[::distance].unique()) >= most * len(last):
+        return rows, rows
+    different, groups = sums.unique(return_inverse=True)
     if len(different) >= most * len(rows):
         return rows, rows
     examples = torch.empty_like(different).scatter_(0, groups, rows)
@@ -130,8 +133,7 @@ def _words(values: Sequence[Tensor]) -> Tensor:
     """Return all bits of rows of any dtypes, int64 [num_rows, n]."""
     parts = []
     for value in values:
-        flat = value.flatten(1) if value.ndim > 1 else value.unsqueeze(1)
-        octets = flat.contiguous().view(torch.uint8)
+        octets = _flat(value).contiguous().view(torch.uint8)
         missing = -octets.shape[1] % 8
         if missing:
             octets = torch.nn.functional.pad(octets, (0, missing))
@@ -141,9 +143,13 @@ def _words(values: Sequence[Tensor]) -> Tensor:
     return torch.cat(parts, dim=1)
 
 
+def _flat(value: Tensor) -> Tensor:
+    return value.flatten(1) if value.ndim > 1 else value.unsqueeze(1)
+
+
 def _sums(words: Tensor) -> Tensor:
     """Return a hash of each row, int64 [num_rows]."""
-    return ((words ^ (words >> 32)) * _weights(words.shape[1])).sum(dim=1)
+    return (words >> 32).bitwise_xor_(words).mv(_weights(words.shape[1]))
 
 
 @cache

@@ -229,14 +229,25 @@ def test_the_benchmark_prints_a_row_for_everybody(capsys):
     assert all("0 of 1 seeds" in line for line in lines[2:])
 
 
-def test_without_stable_baselines_ours_is_measured_alone(capsys, monkeypatch):
+def test_without_stable_baselines_and_jax_ours_is_measured_alone(capsys, monkeypatch):
     monkeypatch.setattr(benchmark, "find_spec", lambda name: None)
 
     benchmark.main(["--agents", "a2c", "--rounds", "1", "--seconds", "0.001", "--seeds", "0"])
 
     printed = capsys.readouterr()
     assert "pip install 'ctgraph_rl[benchmark]'" in printed.err.replace("\n", " ")
+    assert "JAX is missing and not measured: pip install jax" in printed.err.splitlines()
     assert [line.split("|")[3].strip() for line in printed.out.splitlines()[4:]] == ["ours"]
+
+
+def test_jax_learns_with_the_settings_of_ours():
+    jax_ppo = pytest.importorskip("benchmarks.jax_ppo", reason="needs jax")
+    learner = jax_ppo.JAX("ppo", benchmark.settings("ppo"), benchmark.TASKS["CT-FO-B1"], 0)
+
+    for _ in range(10):
+        assert learner.learn() == 8192
+
+    assert learner.success() > 0.95
 
 
 def test_cells_are_measured_in_place_of_an_lstm(capsys):
