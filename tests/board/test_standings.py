@@ -39,10 +39,11 @@ def entry(name: str, scores: Sequence[float | None], of: Track = SMALL, variant:
     method["bytes_per_task"] = more.pop("bytes_per_task", 0)
     method["compute"]["hours"] = 0.25
     verification = Verification(more.pop("level", "submitted"), *more.pop("verification", ()))
-    about = {"verification": verification, "failed": {}, "agent_bytes": 1234, "folder": Path("made"), **more}
+    method["failed"] = more.pop("failed", {})
+    about = {"verification": verification, "agent_bytes": 1234, "folder": Path("made"), **more}
     values = dict.fromkeys(("normalised_performance", "average_performance", "forgetting"), tuple(scores))
     digest = hashlib.sha256(name.encode()).hexdigest()
-    return BoardEntry(digest, method, of, of.variants[variant], seeds=of.seeds, values=values, **about)
+    return BoardEntry(digest, method, of, of.variants[variant], values=values, **about)
 
 
 def some(low: float, high: float, count: int = 20) -> list[float]:

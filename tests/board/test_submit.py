@@ -20,7 +20,7 @@ from helpers.sweeping import command_line
 from ctgraph_rl import Recorder, RunLog
 from ctgraph_rl.board import submit as module
 from ctgraph_rl.board.method_yaml import fact_rules, read_method
-from ctgraph_rl.board.rescore import oracle_rule, scores_of
+from ctgraph_rl.board.rescore import oracle_rule, rescore, scores_of
 from ctgraph_rl.board.submission import log_sum, read_submission
 from ctgraph_rl.board.submit import submit
 from ctgraph_rl.log.files import locked_new
@@ -349,6 +349,7 @@ def test_a_run_with_experts_is_submitted_without_their_logs(
     stored = json.loads(Path("runs/one/metrics.json").read_text())
     assert scores_of(made, run)["average_performance"] == stored["average_performance"]["value"]
     assert [path.name for path in Path("made/logs").iterdir()] == ["one.jsonl.gz"]
+    assert [check.text for check in rescore(made) if not check.passed] == []
     log = made.log(run)
     assert len(log.of_kind("experts")[0]["experts"]) == 4
     log.measurements = [line for line in log.measurements if line["kind"] != "experts"]

@@ -65,7 +65,7 @@ def notes(table: BoardTable) -> list[str]:
         found += [f"{line.name} has no rank: {why}."] if why else []
         none = line.entry.verification.why_none
         found += [f"{line.name}: {none}."] if none else []
-        for seed, reason in line.entry.failed.items():
+        for seed, reason in line.entry.method["failed"].items():
             found.append(f"{line.name}, seed {seed} failed: {reason}")
     return found
 
@@ -135,7 +135,7 @@ def scores_csv(tables: Sequence[BoardTable]) -> str:
         for line in table.standings:
             entry = line.entry
             for metric, values in entry.values.items():
-                for seed, value in zip(entry.seeds, values, strict=True):
+                for seed, value in zip(table.track.seeds, values, strict=True):
                     rows.append((entry.id, seed, metric, value))
     return csv_text(rows)
 
@@ -164,7 +164,7 @@ def _values(table: BoardTable) -> NamedValues:
             "measures": {name: _numbers(estimate) for name, estimate in line.estimates.items()},
             "values": entry.values,
             "agent_bytes": entry.agent_bytes,
-            "failed": entry.failed,
+            "failed": entry.method["failed"],
         }
         entries.append(values)
     comparisons = []

@@ -28,7 +28,7 @@ class BoardEntry:
 
     Args:
         method: from ``method.yaml``.
-        values: of the track's score and `board_columns`, one for each seed, or None.
+        values: of the track's score and `board_columns`, one for each seed of the track, or None.
         agent_bytes: of the largest agent, if a run left one.
     """
 
@@ -37,9 +37,7 @@ class BoardEntry:
     track: Track
     variant: Variant
     verification: Verification
-    seeds: tuple[int, ...]
     values: Mapping[str, tuple[float | None, ...]]
-    failed: Mapping[int, str]
     agent_bytes: int | None
     folder: Path
 
@@ -82,7 +80,7 @@ class BoardEntry:
     @property
     def why_not_ranked(self) -> str | None:
         """Why it has no rank, if it has none."""
-        without = [str(seed) for seed, value in zip(self.seeds, self.scores, strict=True) if value is None]
+        without = [str(seed) for seed, value in zip(self.track.seeds, self.scores, strict=True) if value is None]
         if self.level == "failed":
             return "its verification found differences"
         return f"no score of seed {', '.join(without)}" if without else None
@@ -153,9 +151,7 @@ def make_entry(submission: Submission) -> BoardEntry:
         track=own if other else track,
         variant=variant,
         verification=verification_of(submission),
-        seeds=track.seeds,
         values=values,
-        failed={run.seed: str(run.reason) for run in submission.runs if not run.finished},
         agent_bytes=max((run.agent_bytes for run in submission.runs if run.agent_bytes is not None), default=None),
         folder=submission.path,
     )
