@@ -36,7 +36,7 @@ from ctgraph_rl.tasks.gain import optimal_gain, reached_by_policies
 
 EMBEDS = ("every", "num_samples", "buffer_size", "num_references", "num_directions", "num_quantiles")
 
-SAMPLED = {"exact": False, "num_episodes": 4}
+SAMPLED = {"exact": False, "num_episodes": 4, "every": 0}
 
 
 def stream(evaluation=None, protocol=None, **changes):
@@ -122,7 +122,7 @@ def test_an_agent_that_does_not_learn_has_no_jump_start_and_equal_returns():
     )
 
 
-@pytest.mark.parametrize("boundaries", ["announced", "hidden"])
+@pytest.mark.parametrize("boundaries", [pytest.param("announced", marks=pytest.mark.slow), "hidden"])
 def test_a_resumed_life_ends_with_the_same_weights(boundaries, tmp_path):
     life = stream({"every": 0}, {"boundaries": boundaries}, num_frames=80)
 
@@ -134,7 +134,7 @@ def test_a_resumed_life_ends_with_the_same_weights(boundaries, tmp_path):
 
 
 def test_an_unfinished_life_and_noisy_episodes_have_no_windows():
-    life = stream({**SAMPLED, "every": 0}, reward_std=1.0)
+    life = stream(SAMPLED, reward_std=1.0)
     log = learn_curriculum(life, Scripted(at_random, num_steps=16))
     cut = RunLog()
     cut.measurements = [m for m in log.measurements if m["frames"] < 200]
@@ -231,14 +231,18 @@ def test_an_agent_keeps_copies_of_its_policy_for_few_tasks():
     assert len(agent._copies) == 3
 
 
-def test_tables_of_a_life_have_windows_in_place_of_tasks(tmp_path):
+@pytest.fixture(scope="module")
+def run_of_twelve(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("life")
     life = stream({"every": 0, "greedy": False}, num_tasks=12)
-    agent = learner(life)
-    train(life, agent, tmp_path, 0, config={"agent": {"_target_": "baselines.a2c.A2C"}, "seed": 0})
+    train(life, learner(life), folder, 0, config={"agent": {"_target_": "baselines.a2c.A2C"}, "seed": 0})
+    return read_run(folder)
 
-    run = read_run(tmp_path)
 
-    log = RunLog.read(tmp_path / "run.jsonl")
+def test_tables_of_a_life_have_windows_in_place_of_tasks(run_of_twelve):
+    run = run_of_twelve
+
+    log = RunLog.read(run.path / "run.jsonl")
     at_end = {}
     for m in log.of_kind("evaluation"):
         if m["moment"] == "after":
@@ -251,26 +255,24 @@ def test_tables_of_a_life_have_windows_in_place_of_tasks(tmp_path):
     assert [len(curve) for curve in run.history.training.values()] == [2, 2, *[1] * 8]
     assert run.metrics["never_adapted"]["value"] == 1.0
     console = Console(width=80, record=True)
-    print_summary(tmp_path, console)
+    print_summary(run.path, console)
     printed = console.export_text()
     assert "…" not in printed
     assert ">= 64.00" in printed and ">= 0.00" not in printed
     assert "adaptation frames: at least; 100% of tasks never reach 0.9" in printed
 
 
-def test_figures_of_a_life_have_the_lines_of_policies_that_do_not_learn(tmp_path):
+def test_figures_of_a_life_have_the_lines_of_policies_that_do_not_learn(run_of_twelve):
     pytest.importorskip("matplotlib")
     from ctgraph_rl.report.figures.heatmaps import transfer_maps
     from ctgraph_rl.report.figures.life_windows import life_windows
     from ctgraph_rl.report.sections import sections
 
-    life = stream({"every": 0, "greedy": False}, num_tasks=2)
-    train(life, learner(life), tmp_path, 0, config={"agent": {"_target_": "baselines.a2c.A2C"}, "seed": 0})
-    [section] = sections([read_run(tmp_path)])
+    [section] = sections([run_of_twelve])
 
     returns, _, lost, _ = life_windows(section).figure.axes
 
-    reached = reached_by_policies(life.tasks[0], 64)
+    reached = reached_by_policies(stream().tasks[0], 64)
     grey = [{round(line.get_ydata()[0], 9) for line in axes.lines[2:]} for axes in (returns, lost)]
     assert grey[0] == {round(each.at_end, 9) for each in reached.values()}
     assert grey[1] == {round(each.in_frames / 64, 9) for each in reached.values()}
