@@ -5,11 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from statistics import fmean
 
+import curricula
 from ctgraph_rl.draw.style import new_figure, save_figure
+from ctgraph_rl.tasks.gain import reached_by_policies
 from studies.raw import Raw, fill, groups, machines, mean_of, read, table
 from studies.verdicts import Effect
 
 NAME = "streams"
+TRIALS = "streams_trials"
 
 AGENTS = {"ppo": "PPO", "lstm_ppo": "LSTM-PPO", "dqn": "DQN"}
 METHODS = {"finetune": "fine-tuned", "ewc": "EWC", "mask_ri": "Mask RI", "scratch": "new weights for each task"}
@@ -21,8 +24,28 @@ LESS = 0.1
 
 
 def runs() -> dict[tuple[str, ...], Raw]:
-    """Return the lines of all seeds by agent and method."""
-    return groups(read(NAME), "agent", "method")
+    """Return the lines of all seeds by agent and method, with rates chosen by a tenth of the life."""
+    return groups([line for line in read(NAME) if line["k"] == "10"], "agent", "method")
+
+
+def trials() -> dict[tuple[str, ...], Raw]:
+    """Return the tuning runs over whole lives by method and learning rate."""
+    return groups(read(TRIALS), "method", "learning_rate")
+
+
+def chosen(method: str, part: str) -> str:
+    """Return the learning rate with the largest mean return in ``first_tenth`` or ``whole_life``."""
+    means = {}
+    for (name, rate), lines in trials().items():
+        if name == method:
+            means[rate] = fmean(float(line[part]) for line in lines)
+    return max(means, key=lambda rate: means[rate])
+
+
+def tuned_on_all(method: str) -> Raw:
+    """Return PPO's lines of all seeds with the rate that the whole life chooses."""
+    wanted = ("ppo", method, chosen(method, "whole_life"))
+    return [line for line in read(NAME) if (line["agent"], line["method"], line["learning_rate"]) == wanted]
 
 
 def solved(line: dict[str, str]) -> list[float]:
@@ -38,12 +61,15 @@ def numbers(lines: Raw, column: str) -> list[float | None]:
 def table_of_runs() -> str:
     """Return a row for each agent and method: means over seeds with their intervals."""
     rows = []
-    for (agent, method), lines in runs().items():
+    named = {f"{AGENTS[agent]}, {METHODS[method]}": lines for (agent, method), lines in runs().items()}
+    for method in ("finetune", "ewc"):
+        named[f"PPO, {METHODS[method]}, k = 100"] = tuned_on_all(method)
+    for name, lines in named.items():
         per_frame = [float(line["frame_regret"]) / frames(line) for line in lines]
         seconds = [float(line["cpu_seconds"]) / int(line["num_tasks"]) for line in lines]
         rows.append(
             [
-                f"{AGENTS[agent]}, {METHODS[method]}",
+                name,
                 str(len(lines)),
                 mean_of([fmean(solved(line)) for line in lines], SHARES),
                 mean_of([solved(line)[0] for line in lines], SHARES),
@@ -56,6 +82,15 @@ def table_of_runs() -> str:
         )
     head = ["learner", "seeds", "solved", "first window", "last window", "kept after 1", "after 10", "regret per frame"]
     return table([*head, "CPU seconds a task"], rows)
+
+
+def table_of_trials() -> str:
+    """Return a row for each method and learning rate of the tuning runs."""
+    rows = []
+    for (method, rate), lines in trials().items():
+        means = [fmean(float(line[part]) for line in lines) for part in ("first_tenth", "whole_life", "solved")]
+        rows.append([METHODS[method], rate, str(len(lines)), f"{means[0]:.3f}", f"{means[1]:.3f}", f"{means[2]:.2f}"])
+    return table(["PPO", "learning rate", "seeds", "k = 10", "k = 100", "solved"], rows)
 
 
 def frames(line: dict[str, str]) -> int:
@@ -71,12 +106,13 @@ def claims() -> str:
         losses = [solved(line)[0] - solved(line)[-1] for line in found.get((agent, "finetune"), [])]
         rows.append(_claim(f"{name}, fine-tuned, solves fewer tasks in the last window than in the first", losses))
         for method in ("ewc", "mask_ri", "scratch"):
-            gains = []
-            for line in found.get((agent, method), []):
-                same = [each for each in found.get((agent, "finetune"), []) if each["seed"] == line["seed"]]
-                if same:
-                    gains.append(fmean(solved(line)) - fmean(solved(same[0])))
+            gains = _gains(found.get((agent, method), []), found.get((agent, "finetune"), []))
             rows.append(_claim(f"{name} solves more tasks with {METHODS[method]} than fine-tuned", gains))
+    whole = tuned_on_all("finetune")
+    longer = _gains(whole, found["ppo", "finetune"])
+    rows.append(_claim("PPO, fine-tuned, solves more tasks if tuned on the whole life than on a tenth", longer))
+    more = _gains(whole, tuned_on_all("ewc"))
+    rows.append(_claim("PPO, tuned on the whole life, solves more tasks fine-tuned than with EWC", more))
     return table(["sentence", "difference", "seeds", "verdict"], [row for row in rows if row[2] != "0"])
 
 
@@ -85,10 +121,20 @@ def counts() -> dict[str, str]:
     found = {}
     for (agent, method), lines in runs().items():
         name = f"{agent}_{method}"
-        found[name] = f"{100 * fmean(fmean(solved(line)) for line in lines):.0f}"
+        found[name] = tasks_solved(lines)
         found[f"{name}_first"] = f"{10 * fmean(solved(line)[0] for line in lines):.0f}"
         found[f"{name}_last"] = f"{10 * fmean(solved(line)[-1] for line in lines):.0f}"
     return found
+
+
+def _gains(lines: Raw, others: Raw) -> list[float]:
+    before = {line["seed"]: fmean(solved(line)) for line in others}
+    return [fmean(solved(line)) - before[line["seed"]] for line in lines if line["seed"] in before]
+
+
+def tasks_solved(lines: Raw) -> str:
+    """Return how many of a hundred tasks were solved, the mean over seeds."""
+    return f"{100 * fmean(fmean(solved(line)) for line in lines):.0f}"
 
 
 def _claim(sentence: str, values: list[float]) -> list[str]:
@@ -118,9 +164,17 @@ def draw(folder: Path) -> None:
 def page() -> str:
     """Return the page."""
     lines = read(NAME)
-    rates = {AGENTS[line["agent"]]: line["learning_rate"] for line in lines}
+    rates = {AGENTS[line["agent"]]: line["learning_rate"] for line in lines if line["k"] == "10"}
+    life = curricula.load("stream", num_frames=int(lines[0]["num_frames"]))
+    lost = reached_by_policies(life.examples[0], life.blocks.num_frames)
     texts = {
         "table": table_of_runs(),
+        "trials": table_of_trials(),
+        "whole_finetune": chosen("finetune", "whole_life"),
+        "whole_ewc": chosen("ewc", "whole_life"),
+        "ppo_whole": tasks_solved(tuned_on_all("finetune")),
+        "ewc_whole": tasks_solved(tuned_on_all("ewc")),
+        **{name: f"{of.in_frames / life.blocks.num_frames:.4f}" for name, of in lost.items()},
         "claims": claims(),
         "rates": ", ".join(f"{name} {rate}" for name, rate in rates.items()),
         "frames": f"{int(lines[0]['num_frames']):,}",
