@@ -6,6 +6,7 @@ import pytest
 from helpers.paths import CHECKOUT
 
 import curricula
+from ctgraph_rl.tasks.gain import reached_by_policies
 
 PAGE = CHECKOUT / "docs" / "results" / "streams.md"
 
@@ -41,3 +42,23 @@ def test_regret_and_solved_tasks_are_those_of_one_life(streams):
         assert float(line["window_solved"]) == pytest.approx(solved[-1], abs=1e-3)
         assert 0 <= sum(solved) <= (1 - float(line["never_adapted"])) * 10 + 1e-3
         assert 0 <= float(line["frame_regret"]) / streams.frames(line) <= 1 / 6 + 1e-3
+
+
+def test_settings_are_those_that_a_part_of_the_life_chooses(streams):
+    shared = {line["agent"]: line["learning_rate"] for lines in streams.runs().values() for line in lines}
+
+    assert streams.chosen("finetune", "first_tenth") == shared["ppo"] == "0.01"
+    assert streams.chosen("ewc", "whole_life") == "0.01"
+    assert {line["learning_rate"] for line in streams.read(streams.NAME) if line["k"] == "100"} == {
+        streams.chosen("finetune", "whole_life")
+    }
+
+
+def test_regret_per_frame_of_policies_without_learning_is_in_the_text(streams):
+    reached = reached_by_policies(curricula.load("stream").tasks[0], 12_288)
+    lost = {name: each.in_frames / 12_288 for name, each in reached.items()}
+
+    assert (
+        f"A search in each block loses {lost['search']:.4f}, the random policy {lost['random']:.3f}" in streams.page()
+    )
+    assert lost["optimal"] == pytest.approx(0.0) == lost["memoryless"]
