@@ -81,8 +81,7 @@ def from_meta_json(path: str | PathLike[str], num_frames: int | Sequence[int], n
             (len(labels) == count, f"task_label_ids must be one for each of {count} tasks, got {len(labels)}"),
             (least <= length, f"label_dim must be at least {least}, one more than a label, got {length}"),
         )
-        ids = tuple(one_id_each(tuple(tasks), labels).values())
-        protocol = Protocol("one_hot", num_task_ids=length, task_ids=ids)
+        protocol = Protocol("one_hot", num_task_ids=length, task_ids=one_id_each(tuple(tasks), labels))
         return sequence(name or file.stem, tasks, num_frames, source=f"meta-JSON file {file.name}", protocol=protocol)
 
 

@@ -6,7 +6,7 @@ with the images of seed 2. Environments are as `Task.from_json` reads their file
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from ctgraph_rl.checks import NamedValues, is_int, require
@@ -114,12 +114,11 @@ def labelled(
     evaluation: Evaluation = MASK_EVALUATION,
 ) -> Curriculum:
     """An announced block for each task, with one-hot task ids of length ``num_task_ids``; tasks may repeat."""
-    by_task = one_id_each(tasks, ids)
-    protocol = Protocol("one_hot", num_task_ids=num_task_ids, task_ids=tuple(by_task.values()))
+    protocol = Protocol("one_hot", num_task_ids=num_task_ids, task_ids=one_id_each(tasks, ids))
     return sequence(name, tasks, num_frames, source=source, protocol=protocol, evaluation=evaluation)
 
 
-def one_id_each(tasks: Tasks, ids: Sequence[int]) -> Mapping[Task, int]:
+def one_id_each(tasks: Tasks, ids: Sequence[int]) -> tuple[int, ...]:
     """The id of each task, by first appearance.
 
     Raises:
@@ -130,7 +129,7 @@ def one_id_each(tasks: Tasks, ids: Sequence[int]) -> Mapping[Task, int]:
         known = by_task.setdefault(task, number)
         rule = f"a task has one id in a curriculum, but {task.label_parts['goal']} would have {known} and {number}"
         require((known == number, rule))
-    return by_task
+    return tuple(by_task.values())
 
 
 def chosen(what: str, number: int, choices: Sequence[Any]) -> Any:
