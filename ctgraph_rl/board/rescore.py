@@ -126,18 +126,25 @@ def _rules(what: str, rules: Sequence[Rule], expected: str, found: str) -> Check
 
 
 def _of_the_log(submission: Submission, run: SubmittedRun, log: RunLog) -> Iterator[Check]:
-    yield equal("sum of the log", run.log_sha256, log_sum(log), run.run)
     about = (log.of_kind("run") or [{}])[0]
     config = dict(about.get("config") or {})
-    yield equal("seed", run.seed, config.pop("seed", None), run.run)
-    changed = differences(config, submission.config)
-    yield Check("config", "equal settings", listed(changed) or "equal settings", not changed, run.run)
-    yield equal("versions", dict(submission.versions), about.get("versions"), run.run)
-    yield equal("curriculum of the log", submission.curriculum.fingerprint, about.get("fingerprint"), run.run)
-    yield equal("seconds", (log.measurements or [{}])[-1].get("seconds", 0.0), run.seconds, run.run)
-    yield equal("group", run.group, tuple(about.get("together") or ()), run.run)
-    stored = about.get("machine"), about.get("num_threads"), about.get("cpu")
-    yield equal("machine", (run.machine, run.num_threads, run.cpu or None), stored, run.run)
+    seed = config.pop("seed", None)
+    changed = listed(differences(config, submission.config))
+    last = (log.measurements or [{}])[-1]
+    compared = {
+        "sum of the log": (run.log_sha256, log_sum(log)),
+        "seed": (run.seed, seed),
+        "config": ("equal settings", changed or "equal settings"),
+        "versions": (dict(submission.versions), about.get("versions")),
+        "curriculum of the log": (submission.curriculum.fingerprint, about.get("fingerprint")),
+        "seconds": (last.get("seconds", 0.0), run.seconds),
+        "group": (run.group, tuple(about.get("together") or ())),
+        "machine": (run.machine, about.get("machine")),
+        "threads": (run.num_threads, about.get("num_threads")),
+        "CPU": (run.cpu or None, about.get("cpu")),
+    }
+    for what, (expected, found) in compared.items():
+        yield equal(what, expected, found, run.run)
     if run.finished:
         yield from of_the_protocol(submission.curriculum, run.seed, log, run.run)
 

@@ -89,7 +89,7 @@ def test_another_curriculum_is_found(submission):
         (lambda given: given["runs"][1].update(seed=150), "seeds"),
         (lambda given: given["runs"][1].update(group=[0, 1]), "group"),
         (lambda given: given["runs"][1].update(seconds=1e6), "seconds"),
-        (lambda given: given["runs"][1].update(num_threads=2), "machine"),
+        (lambda given: given["runs"][1].update(num_threads=2), "threads"),
         (lambda given: given["config"]["agent"].update(gamma=0.98), "config"),
         (lambda given: given["versions"].update(torch="1"), "versions"),
         (lambda given: given["method"]["given"].update(boundaries="hidden"), "method"),
