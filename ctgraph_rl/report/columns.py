@@ -84,7 +84,7 @@ def caveats(run: Run) -> dict[str, str]:
     learned = known.get("tasks_learned")
     tasks = {task for block in run.history.trained for task in block} if run.history else set()
     if learned is not None and learned < len(tasks):
-        sentence = f"{learned:g} of {len(tasks)} tasks were learned in their blocks; no other can be forgotten"
+        sentence = f"only {learned:g} of {len(tasks)} tasks were learned in their blocks"
         found = {"forgetting": sentence, "relative_forgetting": sentence}
     never = known.get("never_adapted")
     if never:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import fnmatch
 import re
 from typing import NamedTuple
 
@@ -32,7 +33,11 @@ ROWS = [
 
 
 def names_in(cell: str) -> list[str]:
-    return re.findall(r"`(\w+)`", cell)
+    """The curricula of a cell, where ``fo_b1_*`` stands for all whose names begin so."""
+    found = []
+    for name in re.findall(r"`([\w*]+)`", cell):
+        found += fnmatch.filter(curricula.names(), name) if name.endswith("*") else [name]
+    return found
 
 
 def curricula_with_a_study() -> set[str]:
