@@ -55,7 +55,7 @@ def test_readme_says_how_many_seeds_solve_depth_5(make):
     )
     assert (
         "combines masks of earlier tasks, solves all eight tasks in 20 of 20 seeds. Fine-tuned PPO solves both tasks "
-        "of depth 5 in 2 of 20, and PPO that trains on one of the two in 0 of 40 (one epoch a batch; " in README
+        "of depth 5 in 2 of 20. PPO that trains on one of the two solves it in 0 of 40 (one epoch a batch; " in README
     )
     assert "`1.1.1.1.1` in eight and `1.1.1.1.2` in two" in LIFELONG  # of the eight: test_lifelong_claims
     assert "Mask LC solves all eight tasks in every seed" in LIFELONG
