@@ -12,8 +12,26 @@ SMALL = {
     "continual_backprop": ["plasticity.rate=0.2", "plasticity.maturity=1"],
     "c_chain": ["plasticity.window=2"],
 }
-AGENTS = ("ppo", "a2c", "lstm_ppo", "dqn", "drqn")
-PAIRS = [f"{name} {agent}" for name in names_in("plasticity") if name != "none" for agent in AGENTS]
+AGENTS = {
+    "c_chain": ["ppo", "lstm_ppo", "dqn", "drqn"],
+    "continual_backprop": ["a2c", "lstm_ppo", "dqn"],
+    "fire": ["drqn"],
+    "fresh_optimiser": ["dqn"],
+    "l2_init": ["lstm_ppo"],
+    "layer_norm": ["lstm_ppo", "dqn"],
+    "parseval": ["drqn"],
+    "redo": ["ppo", "drqn"],
+    "shrink_and_perturb": ["dqn"],
+    "shrink_and_perturb_soft": ["a2c"],
+    "upgd": ["ppo"],
+}
+"""One of each sort that a plasticity treats in another way: with memory, with replay, with a target network."""
+
+PAIRS = [f"{name} {agent}" for name, agents in AGENTS.items() for agent in agents]
+
+
+def test_no_plasticity_is_left_out():
+    assert {*AGENTS} == {*names_in("plasticity")} - {"none"}
 
 
 class TestEveryPlasticity(PlasticityContract):
