@@ -31,7 +31,7 @@ from ctgraph_rl.learn.refusals import (
     resumes,
 )
 from ctgraph_rl.learn.segments import Segment, announced_id, collect_segment, guided, log_training, segments
-from ctgraph_rl.learn.unit_metrics import UnitMeter, norms, weights_of
+from ctgraph_rl.learn.unit_metrics import EACH_BATCH, UnitMeter, norms, weights_of
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.tasks.curriculum import Curriculum, Stream
 from ctgraph_rl.tasks.kinds.task_like import close_env
@@ -207,6 +207,7 @@ class Lockstep:
         self.last_frames = curriculum.frames_of(until)
         self.last_learned = curriculum.frames_of(freeze_after)
         self.meters: list[UnitMeter] = []
+        self._metered: int | None = None  # frames that the agents had learned from when units were measured last
         if log_units is not False:
             for agent, log in zip(group.agents, logs, strict=True):
                 self.meters.append(UnitMeter(curriculum, agent, log, log_units))
@@ -333,6 +334,10 @@ class Lockstep:
             self._measure_units(self.curriculum.block_at(frames), "end" if is_end else "during", frames)
 
     def _measure_units(self, block: int, moment: str, frames: int | None = None) -> None:
+        if moment == "during" and self._metered == self.frames:
+            return
+        if moment != EACH_BATCH:
+            self._metered = self.frames
         for number, meter in enumerate(self.meters):
             if number not in self.failed:
                 meter.measure(block, self.frames if frames is None else frames, moment)
@@ -361,7 +366,7 @@ class Lockstep:
             logged[number] = measurements
         self.returns = log_training(self.logs, self.curriculum, batch, start, logged, events=self.events)
         if self.meters and self.meters[0].each_batch:
-            self._measure_units(self.block, "batch")
+            self._measure_units(self.block, EACH_BATCH)
 
     def state(self) -> list[NamedValues]:
         """Return all that the rest of each member's run depends on, as tensors and plain values."""

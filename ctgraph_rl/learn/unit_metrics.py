@@ -7,11 +7,13 @@ zero on a task's few images may serve others.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.utils import parameters_to_vector
 
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import Rule, require
@@ -30,6 +32,9 @@ NUM_FRESH = 256
 
 FRESH_SEED = 2**62 - 1
 
+ROUNDING = 1e-13
+"""Squares of singular values up to this share of the largest are 0; activations have 24 bits."""
+
 EACH_BATCH = "batch"
 """Of ``log_units``: measure after each batch, too; True: at starts, ends and evaluations of blocks."""
 
@@ -38,7 +43,7 @@ LayersByName = Mapping[str, tuple[Tensor, Tensor]]
 
 
 def unit_metrics(layers: LayersByName) -> dict[str, float]:
-    """Return the metrics of layers, of all units together, and under ``_LAYER`` of each.
+    """Return the metrics of hidden layers: of all units together, and under ``_LAYER`` of each; ranks of the last.
 
     - ``dormant_T``: units with a score of at most T: mean absolute activation over the mean of the layer's units (Sokar
       et al. 2023, arXiv 2302.12902).
@@ -47,71 +52,64 @@ def unit_metrics(layers: LayersByName) -> dict[str, float]:
     - ``rank_srank``: singular values that make up 99 % of their sum (Kumar et al. 2021, arXiv 2010.14498).
     - ``rank_stable``: the sum of their squares over the largest square.
 
-    All are shares: of units, or of the largest rank, min(n, H). Without ``_LAYER`` ranks are those of the last layer.
+    All are shares: of units, or of the largest rank, min(n, H).
 
     Raises:
         ValueError: without a layer.
     """
     require((bool(layers), "metrics of units need a hidden layer, and the network has none"))
-    flags: dict[str, list[Tensor]] = {}
-    measured = {}
-    ranks: dict[str, float] = {}
-    for layer, (values, share) in layers.items():
-        sizes = values.detach().double().abs()
-        weights = share.detach().double()
-        means = weights @ sizes
+    found = []
+    for values, share in layers.values():
+        sizes = values.detach().double().abs().cpu().numpy()
+        means = share.double().cpu().numpy() @ sizes
         scores = means / (means.mean() + 1e-9)
-        silent = {f"dormant_{threshold:g}": scores <= threshold for threshold in THRESHOLDS}
-        silent["dead"] = (sizes == 0).all(dim=0)
-        for name, units in silent.items():
-            flags.setdefault(name, []).append(units)
-            measured[f"{name}_{layer}"] = units.double().mean().item()
-        ranks = _ranks(values.detach().double() * weights.sqrt().unsqueeze(1))
-        for name, value in ranks.items():
-            measured[f"{name}_{layer}"] = value
-    of_all = {name: torch.cat(units).double().mean().item() for name, units in flags.items()}
-    return {**of_all, **ranks, **measured}
+        found.append([*(scores <= threshold for threshold in THRESHOLDS), (sizes == 0).all(axis=0)])
+    names = [*(f"dormant_{threshold:g}" for threshold in THRESHOLDS), "dead"]
+    units = np.concatenate(found, axis=1)
+    values, share = layers[[*layers][-1]]
+    ranks = _ranks(values.detach().double() * share.double().sqrt().unsqueeze(1))
+    measured = {**dict(zip(names, units.mean(axis=1).tolist(), strict=True)), **ranks}
+    for layer, flags in zip(layers, found, strict=True):
+        for name, flag in zip(names, flags, strict=True):
+            measured[f"{name}_{layer}"] = float(flag.mean())
+    return measured
 
 
 def _ranks(rows: Tensor) -> dict[str, float]:
-    sigma = torch.linalg.svdvals(rows)
-    total = sigma.sum()
-    if total == 0:
+    products = rows.mT @ rows if len(rows) > rows.shape[1] else rows @ rows.mT  # faster than singular values of rows
+    squares = torch.linalg.eigvalsh(products).cpu().numpy()[::-1]
+    if squares[0] <= 0:
         return dict.fromkeys(("rank_effective", "rank_srank", "rank_stable"), 0.0)
-    shares = sigma / total
-    entropy = torch.special.entr(shares).sum().item()
-    within = (shares.cumsum(0) < 0.99 - 1e-12).sum().item()  # as sums of shares round
-    stable = (sigma.square().sum() / sigma[0].square()).item()
-    most = len(sigma)
+    squares = np.where(squares > ROUNDING * squares[0], squares, 0.0)
+    shares = np.sqrt(squares)
+    shares /= shares.sum()
+    some = shares[shares > 0]
+    within = int((shares.cumsum() < 0.99 - 1e-12).sum())  # as sums of shares round
+    most = len(shares)
     return {
-        "rank_effective": math.exp(entropy) / most,
+        "rank_effective": math.exp(-float(some @ np.log(some))) / most,
         "rank_srank": (within + 1) / most,
-        "rank_stable": stable / most,
+        "rank_stable": float(squares.sum() / squares[0]) / most,
     }
 
 
-def norms(agent: Agent, before: list[Tensor], measurements: Mapping[str, float]) -> dict[str, float]:
+def norms(agent: Agent, before: Tensor, measurements: Mapping[str, float]) -> dict[str, float]:
     """Return the Euclidean norms of all weights, of their change over a batch, and of its mean gradient.
 
     Args:
-        before: copies of the weights before the batch, by `weights_of`.
+        before: the weights before the batch, by `weights_of`.
         measurements: of the batch; ``grad_norm`` is the norm before it is cut, a mean over gradient steps.
     """
     after = weights_of(agent)
-    changes = torch._foreach_sub(after, before)
-    found = {"norm_weights": _norm(after), "norm_updates": _norm(changes)}
+    found = {"norm_weights": after.norm().item(), "norm_updates": (after - before).norm().item()}
     if "grad_norm" in measurements:
         found["norm_gradients"] = measurements["grad_norm"]
     return found
 
 
-def weights_of(agent: Agent) -> list[Tensor]:
-    """Return copies of the policy's weights."""
-    return [parameter.detach().clone() for parameter in agent.policy.parameters()]
-
-
-def _norm(tensors: Sequence[Tensor]) -> float:
-    return torch.stack(torch._foreach_norm(list(tensors))).norm().item()
+def weights_of(agent: Agent) -> Tensor:
+    """Return a copy of the policy's weights, float32 [P]."""
+    return parameters_to_vector(agent.policy.parameters()).detach()
 
 
 def task_images(task: Task, shape: tuple[int, ...]) -> Tensor:
@@ -164,6 +162,7 @@ class UnitMeter:
         self.agent = agent
         self.log = log
         self.each_batch = when == EACH_BATCH
+        self._images: tuple[int, dict[str, Tensor]] = (0, {})  # the last block's, by name
         self._shape = tuple(agent_specs(curriculum).observation["observation"].shape)
 
     def measure(self, block: int, frames: int, moment: str) -> None:
@@ -174,16 +173,29 @@ class UnitMeter:
             frames: of the run so far.
             moment: ``start``, ``during`` or ``end`` of the block, or ``batch``.
         """
-        tasks = [task for task in dict.fromkeys(self.curriculum.blocks[block - 1].tasks) if isinstance(task, Task)]
+        if self._images[0] != block:
+            self._images = block, self._images_of(block)
+        sets = self._images[1]
+        both = torch.cat([*sets.values()])
+        layers = self._activations(both, self.curriculum.blocks[block - 1].tasks[0])
+        last = 0
+        for name, images in sets.items():
+            first, last = last, last + len(images)
+            of_set = {}
+            for layer, (values, share) in layers.items():
+                rows = slice(first * len(values) // len(both), last * len(values) // len(both))
+                of_set[layer] = values[rows], share[rows] / share[rows].sum()
+            found: dict[str, Any] = {"num_images": len(images), **unit_metrics(of_set)}
+            self.log.append("units", moment=moment, block=block, frames=frames, images=name, **found)
+
+    def _images_of(self, block: int) -> dict[str, Tensor]:
+        tasks: Any = [*dict.fromkeys(self.curriculum.blocks[block - 1].tasks)]
+        fresh = fresh_images(tasks[0])
         own = torch.cat([task_images(task, self._shape) for task in tasks]).unique(dim=0)
-        for name, images in (("task", own), ("fresh", fresh_images(tasks[0]))):
-            if images is not None:
-                found = unit_metrics(self._activations(images, tasks[0]))
-                values: dict[str, Any] = {"num_images": len(images), **found}
-                self.log.append("units", moment=moment, block=block, frames=frames, images=name, **values)
+        return {"task": own} if fresh is None else {"task": own, "fresh": fresh}
 
     @torch.no_grad()
-    def _activations(self, images: Tensor, task: Task) -> LayersByName:
+    def _activations(self, images: Tensor, task: Any) -> LayersByName:
         data = ShownTask(task, self._shape, shown_id(self.curriculum, task)).data(images, True)
         device = next(self.agent.policy.parameters()).device
         data = {key: value.to(device) for key, value in data.items()}
