@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 
 import pytest
 from helpers.opposite import write
@@ -33,6 +34,24 @@ def results(tmp_path, monkeypatch):
 
 def test_the_page_is_made_from_the_raw_results():
     assert page.page() == PAGE.read_text(encoding="utf-8")
+
+
+def test_the_guide_names_the_methods_that_gain():
+    gained = {}
+    for curriculum in page.COMPARED:
+        found = page.nine_against(curriculum, "none")
+        gained[curriculum] = {name for name, each in found.items() if each.holm <= 0.05 and each.difference.value > 0}
+    guide = (raw.HERE.parent / "how-to/plasticity.md").read_text(encoding="utf-8")
+    _, both, one = guide.split("\n\n")[2].splitlines()
+
+    methods = {"fire", *re.findall(r"`(\w+)`", both + one)} - {"fresh_optimiser"}
+    assert methods == set.union(*gained.values())
+    assert {"fire", *re.findall(r"`(\w+)`", both)} == set.intersection(*gained.values())
+    more = page.nine_against(page.STREAM, "fresh")["fire"]
+    assert more.holm <= 0.05 and more.difference.low > 0
+    assert page.compared(page.CONFLICT, "fire", "fresh").difference.high > 0
+    assert page.compared(page.CONFLICT, "fresh_optimiser", "none").difference.low > 0
+    assert all(page.forecast_words(curriculum).endswith("cannot be said") for curriculum in page.COMPARED)
 
 
 def test_a_method_is_better_only_after_the_correction_for_nine(results):

@@ -10,18 +10,23 @@ from scipy.stats import rankdata
 
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.statistics import LEAST_FOR_BOOTSTRAP, Comparison
-from studies.raw import Raw, fill, groups, mean_of, read, select, shown, table
+from studies.raw import Raw, fill, groups, read, select, shown, table
 from studies.verdicts import UNKNOWN
 
 NAME = "plasticity"
 MATCHED = "plasticity_matched"
 TRIALS = "plasticity_trials"
 
-AREAS = (0.0, 1.0)
 ALPHA = 0.05
 
 CONFLICT = "goal_conflict"
 STREAM = "stream"
+
+COMPARED = {CONFLICT: range(2, 3), STREAM: range(2, 11)}
+"""Blocks after a change that all seeds have."""
+
+LATE = range(11, 31)
+"""Blocks of a stream that fewer seeds have."""
 
 NINE = {
     "layer_norm": "layer norm",
@@ -50,9 +55,11 @@ COLUMNS = [f"{name}_{images}" for name in METRICS for images in ("task", "fresh"
 RESAMPLES = 4000
 
 
-def later_blocks(curriculum: str, condition: str) -> dict[str, Raw]:
-    """Return the lines of all blocks but the first, by seed."""
-    lines = [line for line in select(read(NAME), curriculum=curriculum, condition=condition) if line["block"] != "1"]
+def later_blocks(curriculum: str, condition: str, blocks: range | None = None) -> dict[str, Raw]:
+    """Return the lines of blocks, those of `COMPARED` unless given, by seed."""
+    wanted = COMPARED[curriculum] if blocks is None else blocks
+    lines = select(read(NAME), curriculum=curriculum, condition=condition)
+    lines = [line for line in lines if int(line["block"]) in wanted]
     return {seed: of_seed for (seed,), of_seed in groups(lines, "seed").items()}
 
 
@@ -61,10 +68,10 @@ def area(lines: Raw) -> float:
     return fmean(float(line["area"]) for line in lines)
 
 
-def compared(curriculum: str, first: str, second: str) -> Comparison:
+def compared(curriculum: str, first: str, second: str, blocks: range | None = None) -> Comparison:
     """Compare the areas of two conditions, paired by seed."""
-    ours = later_blocks(curriculum, first)
-    theirs = later_blocks(curriculum, second)
+    ours = later_blocks(curriculum, first, blocks)
+    theirs = later_blocks(curriculum, second, blocks)
     seeds = [seed for seed in ours if seed in theirs]
     first_areas = [area(ours[seed]) for seed in seeds]
     return statistics.compare(first_areas, [area(theirs[seed]) for seed in seeds])
@@ -79,18 +86,21 @@ def nine_against(curriculum: str, other: str) -> dict[str, Comparison]:
 def conditions_table() -> str:
     """Return a row for each condition: areas, blocks that reached 0.9, and differences paired by seed."""
     rows = []
-    tested = nine_against(CONFLICT, "none")
+    tested = {name: nine_against(name, "none") for name in COMPARED}
     for condition, label in LABELS.items():
-        of_seeds = later_blocks(CONFLICT, condition)
-        reached = sum(line["reached"] == "True" for lines in of_seeds.values() for line in lines)
-        row = [label, mean_of([area(lines) for lines in of_seeds.values()], AREAS), str(reached)]
-        holm = tested[condition].holm if condition in tested else None
-        cells = [shown(compared(name, condition, "fresh").difference) for name in (CONFLICT, STREAM)]
-        if condition == "fresh":
-            cells = ["", ""]
-        rows.append([*row, cells[0], "" if holm is None else f"{holm:.2g}", cells[1]])
-    head = ["condition", "area", "reached 0.9", "less fresh", "p", f"`{STREAM}`: less fresh"]
-    return table(head, rows)
+        row = [label]
+        for curriculum in COMPARED:
+            of_seeds = later_blocks(curriculum, condition)
+            lines = [line for each in of_seeds.values() for line in each]
+            reached = sum(line["reached"] == "True" for line in lines) / len(lines)
+            found = compared(curriculum, condition, "fresh").difference
+            own = f"area {fmean(map(area, of_seeds.values())):.2f}"
+            row += [f"{100 * reached:.0f}", own if condition == "fresh" else shown(found)]
+            holm = tested[curriculum][condition].holm if condition in NINE else None
+            row.append("" if holm is None else f"{holm:.2g}")
+        rows.append(row)
+    head = ["less fresh", "p"]
+    return table(["condition", "% reached", *head, f"`{STREAM}`: % reached", *head], rows)
 
 
 def better(curriculum: str, other: str = "none") -> str:
@@ -209,6 +219,8 @@ def page() -> str:
         "conditions": conditions_table(),
         "conflict_seeds": len(later_blocks(CONFLICT, "none")),
         "stream_seeds": len(later_blocks(STREAM, "none")),
+        "late_seeds": len(later_blocks(STREAM, "none", LATE)),
+        "loss_late": shown(compared(STREAM, "none", "fresh", LATE).difference),
         "loss_conflict": shown(compared(CONFLICT, "none", "fresh").difference),
         "loss_stream": shown(compared(STREAM, "none", "fresh").difference),
         "matched": matched_words(),
