@@ -92,7 +92,7 @@ def test_every_curriculum_without_a_study_is_in_the_experiment_of_short_runs():
     variants = settings["hydra"]["sweeper"]["variants"]
 
     planned = {name for variant in variants for name in variant["curriculum"].split(",")}
-    assert planned == set(curricula.names()) - curricula_with_a_study() - {"stream", "goal_conflict"}  # streams
+    assert planned == set(curricula.names()) - curricula_with_a_study()
 
 
 def test_every_row_says_what_is_missing_and_links_pages_that_exist():
