@@ -138,7 +138,7 @@ class Recorder:
             ),
             (writes, "overwrite, resume and logger need a run_dir"),
         )
-        curriculum.evaluation.check((*curriculum.tasks, *curriculum.evaluation.held_out))
+        curriculum.evaluation.check((*curriculum.examples, *curriculum.evaluation.held_out))
         check_lines(curriculum)
         self.curriculum = curriculum
         self.run_dir = None if run_dir is None else as_path("run_dir", run_dir)

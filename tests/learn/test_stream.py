@@ -23,7 +23,7 @@ from baselines.methods.mask_lc import MaskLC
 from baselines.methods.mask_sc import MaskSC
 from baselines.methods.packnet import PackNet
 from baselines.methods.scratch import Scratch
-from ctgraph_rl import RunLog, learn_curriculum
+from ctgraph_rl import Recorder, RunLog, learn_curriculum
 from ctgraph_rl.learn.refusals import notes
 from ctgraph_rl.learn.stacked import why_not_together
 from ctgraph_rl.log.scores import scores
@@ -33,6 +33,7 @@ from ctgraph_rl.runs.job import build, curriculum_of
 from ctgraph_rl.runs.read import read_run
 from ctgraph_rl.runs.train import new_agent, train
 from ctgraph_rl.tasks.gain import optimal_gain, reached_by_policies
+from ctgraph_rl.tasks.life import Life
 
 EMBEDS = ("every", "num_samples", "buffer_size", "num_references", "num_directions", "num_quantiles")
 
@@ -148,6 +149,20 @@ def test_a_runs_seed_draws_its_tasks_unless_the_curriculum_has_one(settings, see
     life = curriculum_of(composed(["curriculum=stream", *settings]), Finetune())
 
     assert life.tasks[:3] == curricula.load("stream", seed=seed).tasks[:3]
+
+
+def test_a_run_starts_with_few_tasks_made():
+    def stop(make_state, at_block_end):
+        raise StopIteration
+
+    with patch.object(Life, "_draw_task", autospec=True, side_effect=Life._draw_task) as drawn:
+        life = stream(num_tasks=10_000, protocol={"task_id": "at_boundaries"})
+        agent = Scratch().attach(learner(life), life)
+        Recorder(life)
+        with pytest.raises(StopIteration):
+            learn_curriculum(life, agent, checkpoint=stop)
+
+    assert 0 < drawn.call_count < 10
 
 
 def test_experts_of_a_stream_are_refused(tmp_path):
