@@ -57,9 +57,9 @@ def solved(line: dict[str, str]) -> list[float]:
     return [float(line[f"solved_{window}"]) for window in range(1, NUM_WINDOWS + 1)]
 
 
-def numbers(lines: Raw, column: str) -> list[float | None]:
-    """Return a metric of each seed, None where it is undefined."""
-    return [float(line[column]) if line[column] else None for line in lines]
+def mean_of_known(lines: Raw, column: str) -> str:
+    """Return the mean of a metric over the seeds in which it is defined."""
+    return f"{fmean(float(line[column]) for line in lines if line[column]):.2f}"
 
 
 def table_of_runs() -> str:
@@ -77,8 +77,8 @@ def table_of_runs() -> str:
                 mean_of([fmean(solved(line)) for line in lines], SHARES),
                 f"{fmean(solved(line)[0] for line in lines):.2f}",
                 f"{fmean(solved(line)[-1] for line in lines):.2f}",
-                mean_of(numbers(lines, "retention_1"), (0.0, float("inf"))),
-                mean_of(numbers(lines, "retention_10"), (0.0, float("inf"))),
+                mean_of_known(lines, "retention_1"),
+                mean_of_known(lines, "retention_10"),
                 f"{fmean(per_frame):.3f}",
                 f"{fmean(seconds):.1f}" if seconds else "-",
             ]
