@@ -97,7 +97,7 @@ def table_of_trials() -> str:
         for part in ("first_tenth", "whole_life"):
             rows.setdefault(rate, [rate]).append(f"{fmean(float(line[part]) for line in lines):.3f}")
     head = [f"{METHODS[method]}, k = {k}" for method in ("finetune", "ewc") for k in (10, 100)]
-    return table(["learning rate of PPO", *head], list(rows.values()))
+    return table(["rate", *head], list(rows.values()))
 
 
 def frames(line: dict[str, str]) -> int:
