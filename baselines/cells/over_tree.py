@@ -68,7 +68,7 @@ class LSTMGates(Gates):
         g, squashed = kept
         h, c = after
         carried.add_(given)
-        torch.tanh(carried.chunk(4, dim=1)[2], out=g)
+        g.copy_(carried.chunk(4, dim=1)[2]).tanh_()
         i, f, _, o = carried.sigmoid_().chunk(4, dim=1)
         torch.addcmul(f * before[1], i, g, out=c)
         torch.tanh(c, out=squashed)
@@ -79,7 +79,7 @@ class LSTMGates(Gates):
     def factors(carried: Tensor, kept: CellState, before: CellState) -> CellState:
         g, squashed = kept
         i, f, _, o = carried.chunk(4, dim=1)
-        of_gates = carried * (1 - carried)
+        of_gates = (1 - carried).mul_(carried)
         of_i, of_f, of_g, of_o = of_gates.chunk(4, dim=1)
         of_i.mul_(g)
         of_f.mul_(before[1])
