@@ -96,6 +96,7 @@ class Sweeper(Base):
         self._begun: dict[Path, tuple[int, ...]] = {}
         self._known: dict[str, NamedValues] = {}
         self._num_unknown = 0
+        self._num_processes = 1
         self._has_tuning = False
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
@@ -105,6 +106,7 @@ class Sweeper(Base):
             cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
             with read_write(own.hydra.launcher):
                 own.hydra.launcher.n_jobs = max(1, cores // config.num_threads)
+        self._num_processes = own.hydra.launcher.get("n_jobs") or 1
         super().setup(hydra_context=hydra_context, task_function=task_function, config=own)
         assert self.launcher is not None
         self.config = config  # Hydra 1.4 refuses cells that say another number of processes than this
@@ -266,7 +268,7 @@ class Sweeper(Base):
         return self._values[setting]
 
     def _jobs(self, cells: Mapping[Path, Overrides]) -> dict[Overrides, list[Path]]:
-        """Return the settings of jobs, each with its cells: one, or with ``together`` all seeds.
+        """Return the settings of jobs, each with its cells: one, or with ``together`` all seeds, split over processes.
 
         Cells that began together, or singly, stay so; those without a checkpoint join.
         """
@@ -292,11 +294,13 @@ class Sweeper(Base):
                 alone = seed if begun == () or not seed else ""
                 groups.setdefault((alike, begun, alone), {})[seed] = folder
         jobs: dict[Overrides, list[Path]] = {}
-        for (shared, *_), group in groups.items():
-            first = next(iter(group))
-            own = [f"seed={first}"] if first else []
-            own += ["together=true", f"+seeds=[{','.join(group)}]"] if len(group) > 1 else []
-            jobs[*shared, *own] = list(group.values())
+        for (shared, begun, _), group in groups.items():
+            number = 1 if begun else max(1, min(self._num_processes // len(groups), len(group) // 2))
+            for part in range(number):
+                seeds = list(group)[part::number]
+                own = [f"seed={seeds[0]}"] if seeds[0] else []
+                own += ["together=true", f"+seeds=[{','.join(seeds)}]"] if len(seeds) > 1 else []
+                jobs[*shared, *own] = [group[seed] for seed in seeds]
         return jobs
 
     def _launch(self, jobs: Mapping[Overrides, Sequence[Path]], errors: dict[Path, str]) -> None:

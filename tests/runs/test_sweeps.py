@@ -351,6 +351,25 @@ def test_processes_and_threads_together_use_no_more_than_the_cores(num_threads, 
     assert [each.hydra.launcher.n_jobs for each in (*made_of, sweeper.config)] == [expected, n_jobs, n_jobs]
 
 
+@pytest.mark.parametrize(
+    ("num_processes", "begun", "expected"),
+    [(1, None, ["0123456"]), (2, None, ["0246", "135"]), (9, None, ["036", "14", "25"]), (2, range(7), ["0123456"])],
+)
+def test_seeds_together_are_a_group_for_each_process_of_two_seeds_or_more(num_processes, begun, expected):
+    sweeper = plugin("hydra_plugins.ctgraph_rl_sweeper.CellSweeper")(None, None, False)
+    sweeper.config = OmegaConf.create({"together": True})
+    sweeper._num_processes = num_processes
+    cells = {Path(str(seed)): ("agent=ppo", f"seed={seed}") for seed in range(7)}
+    sweeper._begun = dict.fromkeys(cells, tuple(begun)) if begun else {}
+
+    jobs = sweeper._jobs(cells)
+
+    assert ["".join(map(str, folders)) for folders in jobs.values()] == expected
+    assert [settings[1:] for settings in jobs] == [
+        (f"seed={group[0]}", "together=true", f"+seeds=[{','.join(group)}]") for group in expected
+    ]
+
+
 def test_a_launcher_that_is_not_installed_names_the_extra():
     error = MissingConfigException("Could not find it", missing_cfg_file="hydra/launcher/submitit_slurm")
 
