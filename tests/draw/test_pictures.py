@@ -31,8 +31,10 @@ from ctgraph_rl.tasks.images import ImageFile
 HOME, WAIT, DECISION, END, FAIL = StateType
 
 DOCS = CHECKOUT / "docs"
-PAGE = (DOCS / "how-to" / "draw_and_play.md").read_text(encoding="utf-8")
-COMMANDS = [line for block in re.findall(r"```bash\n(.*?)```", PAGE, re.DOTALL) for line in block.splitlines()]
+PAGES = [DOCS / "how-to" / "draw_and_play.md", DOCS / "explanation" / "ct_graph_in_pictures.md"]
+TEXT = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+LINES = [line for block in re.findall(r"```bash\n(.*?)```", TEXT, re.DOTALL) for line in block.splitlines()]
+COMMANDS = [line for line in dict.fromkeys(LINES) if "describe" not in line and not line.endswith(" kinds.png")]
 
 
 def axes_of(task, **overlays):
@@ -337,7 +339,7 @@ def test_the_commands_of_the_page_run_and_make_its_pictures(command, tmp_path, m
 
 
 def test_the_pages_pictures_are_made_by_its_commands_and_small():
-    shown = re.findall(r"!\[.*?\]\(\.\./pictures/(.*?)\)", PAGE)
+    shown = re.findall(r"!\[.*?\]\(\.\./pictures/(.*?)\)", TEXT)
 
     made = [command.split()[-1] for command in COMMANDS]
     stored = {path.name: path.stat().st_size for path in (DOCS / "pictures").iterdir()}
