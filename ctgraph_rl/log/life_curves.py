@@ -35,19 +35,14 @@ def life_inputs(log: RunLog, stream: Stream) -> NamedValues:
 
     An unfinished run gives none, and a tuning run those of the whole blocks of its part.
     """
-    done = finished_blocks(log, stream)
+    reached = max((m["frames"] for m in log.of_kind("evaluation")), default=0)
+    done = reached // stream.blocks.num_frames
     share = next(map(tuning_share, log.of_kind("run")), None)
     needed = len(stream.blocks) if share is None else min(done, stream.frames_of(share) // stream.blocks.num_frames)
     if done < needed or not needed:
         reason = Undefined(f"the run is not finished: it ended block {done:,} of {max(needed, 1):,}")
         return dict.fromkeys(INPUTS, reason)
     return {**dict.fromkeys(INPUTS, NOT_OF_STREAMS), **life_of_blocks(log, stream, needed)}
-
-
-def finished_blocks(log: RunLog, stream: Stream) -> int:
-    """Return how many blocks of a stream were evaluated at their end."""
-    reached = max((m["frames"] for m in log.of_kind("evaluation")), default=0)
-    return reached // stream.blocks.num_frames
 
 
 def life_of_blocks(log: RunLog, stream: Stream, count: int) -> NamedValues:

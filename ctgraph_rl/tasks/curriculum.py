@@ -323,7 +323,7 @@ class Stream(Curriculum):
         return range(frames, frames * len(self.blocks) + 1, frames)
 
     @cached_property
-    def task_ids(self) -> _DrawnIds:
+    def task_ids(self) -> Mapping[TaskLike, int]:
         """The id of each of ``tasks``, found when it is asked for."""
         return _DrawnIds(self)
 
