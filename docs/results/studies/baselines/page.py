@@ -103,35 +103,11 @@ def solved(lines: Raw) -> str:
     return share_of([line in learned for line in lines]) + (f", {by_chance} by chance" if by_chance else "")
 
 
-def learned_and_met() -> dict[str, str]:
-    """What the page says of A2C on CT-FO-B2: seeds that learned each goal, by sampled episodes, and rewards met."""
-    met = groups(read("rewards_met"), "task")
-    found = {}
-    for task, lines in groups(select(read("baselines_fo_b2"), agent="a2c"), "task").items():
-        goal = task[0].replace(".", "")
-        counts = [int(line["rewards_met"]) for line in met[task]]
-        learned = [success >= SOLVED for success in numbers_in(lines, "sampled_success")]
-        found[f"learned_{goal}"] = f"{sum(learned)} of {len(lines)}"
-        found[f"met_{goal}"] = f"{min(counts)} to {max(counts)}"
-    return found
-
-
 def searching(depth: str) -> list[bool]:
     """Return for each seed whether it finds the goal by the last episode of a trial."""
     lines = select(read("rl2_search"), depth=depth)
     last = max(lines, key=lambda line: int(line["episode"]))["episode"]
     return [success >= FOUND for success in numbers_in(select(lines, episode=last), "greedy_success")]
-
-
-def swapped() -> dict[str, str]:
-    """What the page says of RL^2 on a goal that is swapped once: seeds that learn the new one, and when."""
-    times = []
-    seeds = groups(read("rl2_swap"), "seed").values()
-    for lines in seeds:
-        swap = max(int(line["frames"]) for line in select(lines, block="1"))
-        new = [line for line in select(lines, block="2", task="2") if float(line["greedy_return"]) >= SOLVED]
-        times += [int(line["frames"]) - swap for line in new[:1]]
-    return {"swapped": f"{len(times)} of {len(seeds)}", "swap_frames": f"{min(times):,} to {max(times):,}"}
 
 
 def page() -> str:
@@ -149,7 +125,7 @@ def page() -> str:
         "reruns_equal": str(sum(line["equal"] == line["numbers"] for line in others)),
         "machines": machines(*TABLES),
     }
-    return fill("baselines", texts | learned_and_met() | swapped())
+    return fill("baselines", texts)
 
 
 def draw(folder: Path) -> None:

@@ -91,23 +91,6 @@ def published(exchange: str, found: Sequence[float]) -> tuple[str, str]:
     return stated, f"{fmean(found) - value:+.1f} [{low:+.1f}, {high:+.1f}]"
 
 
-def never(exchange: str) -> str:
-    """Return the tasks, among 28 members, whose final return is below 0.5 in each seed."""
-    of = groups(blocks(exchange, ALL), "task", "member")
-    failed = [task for (task, _), lines in of.items() if max(numbers_in(lines, "final_return")) < 0.5]
-    return ", ".join(f"`{task.removeprefix('goal')}`" for task in failed) or "none"
-
-
-def most_apart() -> tuple[int, float]:
-    """Return the depth at which MOSAIC's sum of returns differs most from the published one, and by how much."""
-    tasks = {line["task"] for line in blocks("mosaic", ALL)}
-    apart = {}
-    for (depth, values), stated in zip(by_depth("mosaic", ALL).items(), SHARED, strict=True):
-        count = sum(1 + task.count(".") == depth for task in tasks)
-        apart[depth] = count * (fmean(values) - stated)
-    return max(apart.items(), key=lambda each: abs(each[1]))
-
-
 def welch(found: Sequence[float], value: float, half: float | None) -> tuple[float, float]:
     """Return Welch's 95 % interval of a mean less a published one, whose own interval is value +- half.
 
@@ -136,12 +119,5 @@ def returns_table() -> str:
 
 
 def texts() -> dict[str, str]:
-    """Return what the template of the page names."""
-    found = {
-        "mosaic": returns_table(),
-        "mosaic_sums": sums_table(),
-        "never_shared": never("mosaic"),
-        "never_any": never("mosaic_no_similarity"),
-    }
-    depth, apart = most_apart()
-    return found | {"apart_depth": str(depth), "apart": f"{apart:+.1f}"}
+    """Return the tables of the page."""
+    return {"mosaic": returns_table(), "mosaic_sums": sums_table()}
