@@ -227,7 +227,15 @@ class PEARL(Learner):
 
     def minibatches(self, batch: TensorDictBase) -> Iterator[Items]:
         """Store a batch, and yield steps of trials, [num_trials, batch_size], each with a context of its trial."""
-        self._store(batch)
+        starts = batch["is_init"] & (batch["next", "trial"] == 1)
+        keys = [*self.specs, "action", ("next", "reward"), ("next", "terminated")]
+        keys += [("next", key) for key in self.specs]
+        kept = {}
+        kept_steps = self.settings.buffer_size // self.num_envs
+        for key, new in {"begins": starts.squeeze(-1), **{key: batch[key] for key in keys}}.items():
+            steps = [self.replay[key], new] if self.replay else [new]
+            kept[key] = torch.cat(steps, dim=1)[:, -kept_steps:].contiguous()
+        self.replay = kept
         begins = self.replay["begins"]
         num_rows, num_steps = begins.shape
         place, first = places(begins)
@@ -245,17 +253,6 @@ class PEARL(Learner):
                 self.minibatch_size, self.settings.num_context, dtype=torch.float32, device=begins.device
             )
             yield {**self._steps(*trial, self.settings.batch_size), **context, "noise": noise}
-
-    def _store(self, batch: TensorDictBase) -> None:
-        begins = batch["is_init"] & (batch["next", "trial"] == 1)
-        keys = [*self.specs, "action", ("next", "reward"), ("next", "terminated")]
-        keys += [("next", key) for key in self.specs]
-        kept = {}
-        kept_steps = self.settings.buffer_size // self.num_envs
-        for key, value in {"begins": begins.squeeze(-1), **{key: batch[key] for key in keys}}.items():
-            steps = [self.replay[key], value] if self.replay else [value]
-            kept[key] = torch.cat(steps, dim=1)[:, -kept_steps:].contiguous()
-        self.replay = kept
 
     def _steps(self, row: Tensor, first: Tensor, last: Tensor, number: int) -> Items:
         share = torch.rand(len(row), number, dtype=torch.float32, device=row.device)

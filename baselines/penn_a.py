@@ -416,19 +416,7 @@ class PennA(TensorDictModuleBase):
         if self.lived < self.settings.num_batches:
             return {}
         fitness = self.rewards.view(-1, self.settings.num_trials).mean(dim=1)
-        measured = {
-            "fitness_mean": fitness.mean().item(),
-            "fitness_best": fitness.max().item(),
-            "neurons_mean": self.population.size.double().mean().item(),
-            "loss_autoencoder": self._learn_latents(batch["observation"].flatten(0, 1)),
-        }
-        self.population = self.settings.children(self.population, fitness)
-        self.generation += 1
-        self.lived = 0
-        self.rewards.zero_()
-        return measured
-
-    def _learn_latents(self, seen: Tensor) -> float:
+        seen = batch["observation"].flatten(0, 1)
         total = torch.zeros_like(self.rewards[0])
         for _ in range(self.settings.num_updates):
             drawn = torch.randint(len(seen), (self.settings.batch_size,), device=seen.device)
@@ -436,7 +424,17 @@ class PennA(TensorDictModuleBase):
             minimise(self.optimiser, loss)
             total += loss.detach()
         require_finite("loss_autoencoder", total)
-        return total.item() / self.settings.num_updates
+        measured = {
+            "fitness_mean": fitness.mean().item(),
+            "fitness_best": fitness.max().item(),
+            "neurons_mean": self.population.size.double().mean().item(),
+            "loss_autoencoder": total.item() / self.settings.num_updates,
+        }
+        self.population = self.settings.children(self.population, fitness)
+        self.generation += 1
+        self.lived = 0
+        self.rewards.zero_()
+        return measured
 
     @override
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> PennA:

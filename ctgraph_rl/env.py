@@ -300,7 +300,12 @@ class CTGraphEnv(EnvBase):
             ValueError: for actions that ``check_actions`` refuses.
         """
         if self.hides_episodes:
-            return self._step_or_start(action, mask)
+            require((mask is None, "rows with hidden episodes step together: leave out _step"))
+            over = self.rows.is_done
+            if self.check_actions:
+                self.rows.check_actions(action, ~over)
+            seen = self.rows.step_or_reset(action, over)  # type: ignore[arg-type]
+            return self._hide(seen) | {"reward": self.rows.reward.unsqueeze(-1)}
         if self.check_actions:
             self.rows.check_actions(action, mask)
         shown = self.rows.step(action, mask)  # type: ignore[arg-type]
@@ -313,14 +318,6 @@ class CTGraphEnv(EnvBase):
         data = self._data(shown.observation, done, is_init, shown)
         data["reward"] = reward.unsqueeze(-1)
         return data
-
-    def _step_or_start(self, action: Tensor | None, mask: Tensor | None) -> RowData:
-        require((mask is None, "rows with hidden episodes step together: leave out _step"))
-        over = self.rows.is_done
-        if self.check_actions:
-            self.rows.check_actions(action, ~over)
-        shown = self.rows.step_or_reset(action, over)  # type: ignore[arg-type]
-        return self._hide(shown) | {"reward": self.rows.reward.unsqueeze(-1)}
 
     def _hide(self, shown: Shown) -> RowData:
         ends = {"done": shown.done, "outcome": shown.outcome, "leaf": shown.leaf}

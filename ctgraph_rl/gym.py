@@ -137,7 +137,15 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
                 (not self._is_over, "no episode is running: reset first"),
             )
         if self._life is not None:
-            return self._live_on(_as_tensor(number))
+            ended = self.rows.is_done
+            if ended.item():
+                self._change_task()
+            seen = self.rows.step_or_reset(_as_tensor(number), ended)
+            self._age += 1
+            self._is_over = self._age == self._life
+            info = {"task": self._number, "outcome": int(seen.outcome.item()), "leaf": int(seen.leaf.item())}
+            shown = add_id(seen.observation.numpy()[0], self._ids, self._number)
+            return shown, self.rows.reward.item(), False, self._is_over, info
         observation, done = self.rows.act(_as_tensor(number))
         self._is_over = bool(done.item())
         outcome = OUTCOME_RUNNING
@@ -152,17 +160,6 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
         if self._next_number != self._number:
             self._number = self._next_number
             self.rows.set_tasks([self.task_pool[self._number]])
-
-    def _live_on(self, action: Tensor) -> tuple[Any, float, bool, bool, NamedValues]:
-        ended = self.rows.is_done
-        if ended.item():
-            self._change_task()
-        seen = self.rows.step_or_reset(action, ended)
-        self._age += 1
-        self._is_over = self._age == self._life
-        info = {"task": self._number, "outcome": int(seen.outcome.item()), "leaf": int(seen.leaf.item())}
-        shown = add_id(seen.observation.numpy()[0], self._ids, self._number)
-        return shown, self.rows.reward.item(), False, self._is_over, info
 
     def render(self) -> Frame | None:
         """The state as a picture, uint8 [192, 384, 3], or text."""

@@ -90,21 +90,15 @@ class Backpropamine(Cell):
         resets = [start.nonzero().squeeze(-1) for start in starts.unbind(1)]
         resets[0] = resets[0][:0]  # zero already
         steps = PlasticSteps(self._step, LARGEST_FAST_WEIGHT, resets)
-        return PlasticSequence.apply(steps, given, *self._plastic(), *state)
-
-    def _plastic(self) -> Plastic:
-        rate = None if self.modulation == "simple" else self.rate
-        if self.modulation == "none":
-            return Plastic(self.recurrent, self.plasticity, rate)
-        return Plastic(
-            self.recurrent,
-            self.plasticity,
-            rate,
-            modulator=self.modulator.weight,
-            modulator_bias=self.modulator.bias,
-            fan_out=self.fan_out.weight,
-            fan_out_bias=self.fan_out.bias,
-        )
+        plastic = Plastic(self.recurrent, self.plasticity, None if self.modulation == "simple" else self.rate)
+        if self.modulation != "none":
+            plastic = plastic._replace(
+                modulator=self.modulator.weight,
+                modulator_bias=self.modulator.bias,
+                fan_out=self.fan_out.weight,
+                fan_out_bias=self.fan_out.bias,
+            )
+        return PlasticSequence.apply(steps, given, *plastic, *state)
 
     def _step(self, given: Tensor, state: CellState, product: Tensor | None = None) -> CellOutput:
         before, hebb, *traces = state

@@ -46,7 +46,9 @@ class LSTM(Cell):
     @override
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
         if not starts[:, 1:].any():
-            output, _ = self.lstm(of_frames(inputs, groups), _layer_first(state))
+            output, _ = self.lstm(
+                of_frames(inputs, groups), tuple(value.transpose(0, 1).contiguous() for value in state)
+            )
             return output
         step = partial(lstm_step, self.lstm)
         before = [value.squeeze(1) for value in state]
@@ -58,10 +60,6 @@ class LSTM(Cell):
         parts = [value.squeeze(1) for value in state]
         gated = GatedTree(LSTMGates, tree, groups)
         return GatesOverTree.apply(gated, given, self.lstm.all_weights[0][1], None, *parts)
-
-
-def _layer_first(state: CellState) -> CellState:
-    return tuple(value.transpose(0, 1).contiguous() for value in state)
 
 
 def lstm_inputs(lstm: nn.LSTM, features: Tensor) -> Tensor:

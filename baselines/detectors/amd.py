@@ -168,13 +168,6 @@ class AMD(Detector):
         history, action, following = steps.unbind(1)
         self.models[self.label].add(history * self.num_outcomes + action * self.num_observations + following)
 
-    def _predicted(self, label: int, history: Tensor) -> Tensor:
-        """Return a label's P(o | a) after histories, float64 [..., actions, observations]."""
-        outcomes = history.unsqueeze(-1) * self.num_outcomes + torch.arange(self.num_outcomes, device="cpu")
-        counts = self.models[label].of(outcomes).double() + self.smoothing
-        counts = counts.unflatten(-1, (self.num_actions, self.num_observations))
-        return counts / counts.sum(dim=-1, keepdim=True)
-
     def _fit_label(self, windows: Tensor) -> int:
         """Return the label that fits windows of steps, int64 [W, window, 3], by its smallest p-value times W."""
         if self.models[self.label].total < self.num_untested:
@@ -196,7 +189,10 @@ class AMD(Detector):
     def p_values(self, label: int, windows: Tensor) -> Tensor:
         """Return a label's p-value in each window of steps, int64 [W, window, 3]: float64 [W]."""
         history, action, following = windows.unbind(-1)
-        predicted = self._predicted(label, history)
+        outcomes = history.unsqueeze(-1) * self.num_outcomes + torch.arange(self.num_outcomes, device="cpu")
+        counts = self.models[label].of(outcomes).double() + self.smoothing
+        counts = counts.unflatten(-1, (self.num_actions, self.num_observations))
+        predicted = counts / counts.sum(dim=-1, keepdim=True)  # P(o | a), float64 [..., actions, observations]
         found = clusters(predicted.flatten(2), self.radius, self.min_neighbours)
         groups = one_hot(found + 1, self.window + 1).double()
         means = torch.einsum("wtc,wtao->wcao", groups, predicted) / groups.sum(1).clamp(min=1)[..., None, None]

@@ -53,7 +53,15 @@ class EWC(SampledImportance):
 
     @override
     def task_importance(self) -> Tensor:
-        return self.mean(self._of_policy) if self.fisher == "policy" else self._of_losses()
+        if self.fisher == "policy":
+            return self.mean(self._of_policy)
+        squares = torch.zeros_like(self.importance)
+        compiles = getattr(self.agent, "compiled_step", None) is not None
+        for minibatch in self.samples.minibatches:
+            usual = compiles and len(minibatch["action"]) == self.agent.minibatch_size
+            add = compiled(add_squared_gradients) if usual else add_squared_gradients
+            add(self.agent, minibatch, self.weights.parameters, squares, max(num_learnt(minibatch), 1))
+        return squares
 
     @override
     def consolidate(self, new: Tensor, weights: Tensor) -> None:
@@ -70,15 +78,6 @@ class EWC(SampledImportance):
         for step in learnt_steps(self.agent.outputs(item)["log_probs"], item):
             for log_prob in step:
                 yield log_prob.exp().detach() * self.gradient(log_prob).square()
-
-    def _of_losses(self) -> Tensor:
-        squares = torch.zeros_like(self.importance)
-        compiles = getattr(self.agent, "compiled_step", None) is not None
-        for minibatch in self.samples.minibatches:
-            usual = compiles and len(minibatch["action"]) == self.agent.minibatch_size
-            add = compiled(add_squared_gradients) if usual else add_squared_gradients
-            add(self.agent, minibatch, self.weights.parameters, squares, max(num_learnt(minibatch), 1))
-        return squares
 
 
 def add_squared_gradients(

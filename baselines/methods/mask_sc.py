@@ -70,7 +70,16 @@ class MaskSC(SelectedMasks):
     def choose(self) -> list[int]:
         earlier = list(range(self.num_combined))
         if self.selection == "similarity":
-            return self._similar()
+            known = self.embeddings.of_slot
+            if self.slot not in known:
+                return []
+            near = {}
+            for slot in range(self.num_combined):
+                if slot in known:
+                    cosine = float(known[slot] @ known[self.slot])
+                    if cosine > self.threshold:
+                        near[slot] = cosine
+            return sorted(near, key=lambda slot: -near[slot])[: self.top_k]
         if self.selection == "random":
             order = torch.randperm(self.num_combined, generator=self.generator, device="cpu")
             return order[: self.top_k].tolist()
@@ -81,18 +90,6 @@ class MaskSC(SelectedMasks):
         tasks = ct_graphs([self.task_in(slot) for slot in (*earlier, self.slot)], self.selection)
         family = [slot for slot in earlier if is_prefix(tasks[slot], tasks[-1])]
         return family if self.selection == "depth_prefix" else family[-1:]
-
-    def _similar(self) -> list[int]:
-        known = self.embeddings.of_slot
-        if self.slot not in known:
-            return []
-        near = {}
-        for slot in range(self.num_combined):
-            if slot in known:
-                cosine = float(known[slot] @ known[self.slot])
-                if cosine > self.threshold:
-                    near[slot] = cosine
-        return sorted(near, key=lambda slot: -near[slot])[: self.top_k]
 
 
 def is_prefix(one: Task, other: Task) -> bool:

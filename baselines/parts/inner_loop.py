@@ -218,7 +218,16 @@ class InnerPolicy(TensorDictModuleBase):
         tensordict.set(("next", "trial"), episode.unsqueeze(-1))
         for name, key in self.own_keys.items():
             tensordict.set(("next", key), own[name])
-        self._remember(tensordict, rewards, episode, forgets=fresh | adapts)
+        earlier = torch.where((fresh | adapts).unsqueeze(-1), 0, tensordict[EPISODES])
+        now = torch.where(episode <= self.adapt_episodes, episode, 0)
+        numbers = torch.cat([earlier, now.unsqueeze(-1)], dim=1)
+        needed = (numbers > 0).any(dim=0)
+        first = int((needed.cumsum(dim=0) == 0).sum())
+        tensordict.set(("next", EPISODES), numbers[:, first:])
+        tensordict.set(("next", REWARDS), rewards[:, first:])
+        for kept, seen_key in zip((ACTIONS, *self.kept_keys), ("action", *self.seen_keys), strict=True):
+            steps = torch.cat([tensordict[kept], tensordict[seen_key].unsqueeze(1)], dim=1)
+            tensordict.set(("next", kept), steps[:, first:])
         return tensordict
 
     def _own(self, theta: NamedWeights, data: Data, rewards: Tensor, *, fresh: Tensor, adapts: Tensor) -> NamedWeights:
@@ -237,18 +246,6 @@ class InnerPolicy(TensorDictModuleBase):
     def before(self, played: Played) -> Episodes:
         """Return what L reads of the steps before an adaptation."""
         return played.episodes(self.model.net, self.gamma, played)
-
-    def _remember(self, data: TensorDictBase, rewards: Tensor, episode: Tensor, *, forgets: Tensor) -> None:
-        earlier = torch.where(forgets.unsqueeze(-1), 0, data[EPISODES])
-        now = torch.where(episode <= self.adapt_episodes, episode, 0)
-        numbers = torch.cat([earlier, now.unsqueeze(-1)], dim=1)
-        needed = (numbers > 0).any(dim=0)
-        first = int((needed.cumsum(dim=0) == 0).sum())
-        data.set(("next", EPISODES), numbers[:, first:])
-        data.set(("next", REWARDS), rewards[:, first:])
-        for kept, key in zip((ACTIONS, *self.kept_keys), ("action", *self.seen_keys), strict=True):
-            steps = torch.cat([data[kept], data[key].unsqueeze(1)], dim=1)
-            data.set(("next", kept), steps[:, first:])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,6 @@ from ctgraph_rl.checks import require
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Arcs = list[tuple[int, int]]
 
 
 def optimal_plan(cost: Floats, supply: Ints, demand: Ints) -> Ints:
@@ -56,7 +55,15 @@ class _Transport:
 
         The path takes units away from arcs of the plan that it passes backwards.
         """
-        column, forward, backward = self._shortest_path(row)
+        column, came_from, came_by = self._shortest_path(row)
+        place = int(came_from[column])
+        forward = [(place, column)]
+        backward: list[tuple[int, int]] = []
+        while place != row:
+            before = int(came_by[place])
+            backward.append((place, before))
+            place = int(came_from[before])
+            forward.append((place, before))
         units = min([most, int(self.left[column]), *(int(self.plan[arc]) for arc in backward)])
         for arc in forward:
             self.plan[arc] += units
@@ -65,8 +72,8 @@ class _Transport:
         self.left[column] -= units
         return units
 
-    def _shortest_path(self, source: int) -> tuple[int, Arcs, Arcs]:
-        """Return the nearest column that needs more, and the path's arcs, forward and backward.
+    def _shortest_path(self, source: int) -> tuple[int, Ints, Ints]:
+        """Return the nearest column that needs more, the row that each column came from, and each row's column.
 
         Potentials change so that the path has reduced costs of 0.
         """
@@ -98,16 +105,4 @@ class _Transport:
         self.reduced -= (least - row_distance).clip(min=0.0)[:, None]  # of rows that were not reached it is -inf
         self.reduced += np.where(done, least - distance, 0.0)
         self.reduced.clip(min=0.0, out=self.reduced)  # rounding
-        return column, *_arcs(source, column, came_from, came_by)
-
-
-def _arcs(source: int, column: int, came_from: Ints, came_by: Ints) -> tuple[Arcs, Arcs]:
-    row = int(came_from[column])
-    forward = [(row, column)]
-    backward = []
-    while row != source:
-        column = int(came_by[row])
-        backward.append((row, column))
-        row = int(came_from[column])
-        forward.append((row, column))
-    return forward, backward
+        return column, came_from, came_by

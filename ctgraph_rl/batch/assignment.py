@@ -113,17 +113,14 @@ class Assignment(NamedTuple):
         """Return the assignment when the rows of a mask, bool [N], start an episode."""
         following = self._replace(episodes=self.episodes + mask)
         if self.switch is not None:
-            following = following._replace(choice=self._next_choice(self.switch, following.episodes, place))
+            if self.switch.together:
+                clock, past = ((n.sum() // len(n) - 1).expand_as(n) for n in (following.episodes, self.episodes))
+                seed, row, tick = place
+                place = seed[:1], row[:1], tick.amax(0, keepdim=True)
+            else:
+                clock = following.episodes - 1
+                past = self.episodes - 1
+            words = philox.draw(*place, philox.STREAM_TASK)
+            drawn = self.switch.next_task(self.choice, clock.clamp_min(1), len(self.choices), words)
+            following = following._replace(choice=torch.where((clock > past) & (clock > 0), drawn, self.choice))
         return following._replace(task=torch.where(mask, following.chosen, self.task))
-
-    def _next_choice(self, switch: Switch, episodes: Tensor, place: EpisodePlace) -> Tensor:
-        if switch.together:
-            clock, past = ((n.sum() // len(n) - 1).expand_as(n) for n in (episodes, self.episodes))
-            seed, row, tick = place
-            place = seed[:1], row[:1], tick.amax(0, keepdim=True)
-        else:
-            clock = episodes - 1
-            past = self.episodes - 1
-        words = philox.draw(*place, philox.STREAM_TASK)
-        following = switch.next_task(self.choice, clock.clamp_min(1), len(self.choices), words)
-        return torch.where((clock > past) & (clock > 0), following, self.choice)

@@ -73,7 +73,12 @@ def rollout(rows: Rows, policy: TensorPolicy | Tensor, steps: Steps, kernel: str
         >>> steps.observation.shape, steps.reward.shape
         (torch.Size([17, 64, 1, 12, 12]), torch.Size([16, 64]))
     """
-    _check_buffers(rows, steps)
+    t = len(steps.action)
+    wanted = Steps.empty(rows, t, "meta")
+    for name, buffer, like in zip(Steps._fields, steps, wanted, strict=True):
+        fits = buffer.shape == like.shape and buffer.dtype == like.dtype and buffer.device == rows.device
+        got = f"{buffer.dtype} {list(buffer.shape)} on {buffer.device}"
+        require((fits, f"buffers must be those of Steps.empty(rows, {t}), got {name} {got}"))
     require(
         (not rows.tasks_change, "rollout needs rows that keep their tasks; step rows with `Rows.act` and `restart`")
     )
@@ -146,15 +151,6 @@ def _choose_actions(rows: Rows, policy: TensorPolicy, steps: Steps, t: int, star
     require((same, "a policy must not change the rows during a rollout: change them between two rollouts"))
     _check_actions(rows, action, steps.action.shape[1:])
     return action
-
-
-def _check_buffers(rows: Rows, steps: Steps) -> None:
-    t = len(steps.action)
-    wanted = Steps.empty(rows, t, "meta")
-    for name, buffer, like in zip(Steps._fields, steps, wanted, strict=True):
-        fits = buffer.shape == like.shape and buffer.dtype == like.dtype and buffer.device == rows.device
-        got = f"{buffer.dtype} {list(buffer.shape)} on {buffer.device}"
-        require((fits, f"buffers must be those of Steps.empty(rows, {t}), got {name} {got}"))
 
 
 def _check_actions(rows: Rows, action: Tensor, shape: torch.Size) -> None:

@@ -114,7 +114,18 @@ def _figures(found: Sequence[Collective]) -> Iterator[CaptionedFigure]:
         title = (
             f"Who helped whom: {each.about['exchange']}, {each.about['num_members']} members, seed {each.about['seed']}"
         )
-        yield CaptionedFigure("helps", title, f"{title}. {caption}", _draw_helps(each))
+        count = each.about["num_members"]
+        figure = new_figure(0.6 * WIDTH, 0.5 * WIDTH)
+        axes = figure.subplots()
+        cells = np.zeros((count, count))
+        for row in each.helps:
+            cells[row["receiver"], row["sender"]] += 1
+        image = axes.imshow(cells, cmap="viridis", vmin=0, interpolation="none")
+        figure.colorbar(image, ax=axes, label="masks taken over")
+        axes.set(xlabel="sender", ylabel="receiver")
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.get_major_locator().set_params(integer=True)
+        yield CaptionedFigure("helps", title, f"{title}. {caption}", figure)
 
 
 def _draw_times(found: Sequence[Collective]) -> Any:
@@ -135,19 +146,4 @@ def _draw_times(found: Sequence[Collective]) -> Any:
     axes.set(xlabel="members", ylabel="frames to learn a block", ylim=(0, None))
     axes.xaxis.get_major_locator().set_params(integer=True)
     axes.legend()
-    return figure
-
-
-def _draw_helps(collective: Collective) -> Any:
-    count = collective.about["num_members"]
-    figure = new_figure(0.6 * WIDTH, 0.5 * WIDTH)
-    axes = figure.subplots()
-    cells = np.zeros((count, count))
-    for row in collective.helps:
-        cells[row["receiver"], row["sender"]] += 1
-    image = axes.imshow(cells, cmap="viridis", vmin=0, interpolation="none")
-    figure.colorbar(image, ax=axes, label="masks taken over")
-    axes.set(xlabel="sender", ylabel="receiver")
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.get_major_locator().set_params(integer=True)
     return figure

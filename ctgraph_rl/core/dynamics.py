@@ -244,7 +244,12 @@ def _paid(
     Sums are of float32 numbers and their products in float64, hence exact: fused multiply-add changes nothing.
     """
     g = params.g
-    paid = _share(after, goal_leaf, params, uses) * g.goal_reward
+    tree = params.tree
+    arrival = Arrival(after.node - tree.first_leaf, goal_leaf, tree.branching_factor, g.depth, uses.max_depth)
+    earned = uses.reward_fns[0](arrival)
+    for i, reward_fn in enumerate(uses.reward_fns[1:], 1):
+        earned = torch.where(g.reward_fn == i, reward_fn(arrival), earned)
+    paid = earned * g.goal_reward
     if uses.reward_noise:
         noise = (words[4] * g.reward_std).float()
         share = torch.where(g.multiplicative, paid, 1.0) * noise.double() if uses.multiplicative else noise
@@ -255,16 +260,6 @@ def _paid(
         failed = after.state_type == _FAIL
         reward = torch.where(failed if entered is None else failed & entered, g.fail_reward, reward)
     return reward.float()
-
-
-def _share(after: State, goal_leaf: Tensor, params: RowParams, uses: Uses) -> Tensor:
-    tree = params.tree
-    g = params.g
-    arrival = Arrival(after.node - tree.first_leaf, goal_leaf, tree.branching_factor, g.depth, uses.max_depth)
-    share = uses.reward_fns[0](arrival)
-    for i, reward_fn in enumerate(uses.reward_fns[1:], 1):
-        share = torch.where(g.reward_fn == i, reward_fn(arrival), share)
-    return share
 
 
 # Episode
@@ -300,24 +295,20 @@ def begin(state: RowState, mask: Tensor | None, params: RowParams, uses: Uses) -
         state = zeros._replace(tick=state.tick + 1, goal_leaf=state.goal_leaf, episodes_left=state.episodes_left)
         mask = torch.ones_like(state.node, dtype=torch.bool)
     else:
-        state = _cleared(state, mask, uses)
+        starts = mask.long()
+        keeps = 1 - starts
+        nothing = torch.zeros_like(state.reward)
+        reward = torch.where(mask, nothing, state.reward)
+        state = state._replace(
+            state_type=state.state_type * keeps.to(torch.uint8),  # the home state is 0; faster than filling by a mask
+            node=state.node * keeps,
+            tick=state.tick + starts,
+            step_count=state.step_count * keeps,
+            episode_reward=torch.where(mask, nothing, state.episode_reward),
+            reward=reward,
+            paid=torch.where(mask, nothing, state.paid) if uses.step_reward else reward,
+        )
     return _count_episode(state, mask, params) if uses.goal_change else state
-
-
-def _cleared(state: RowState, mask: Tensor, uses: Uses) -> RowState:
-    starts = mask.long()
-    keeps = 1 - starts
-    nothing = torch.zeros_like(state.reward)
-    reward = torch.where(mask, nothing, state.reward)
-    return state._replace(
-        state_type=state.state_type * keeps.to(torch.uint8),  # the home state is 0; faster than filling by a mask
-        node=state.node * keeps,
-        tick=state.tick + starts,
-        step_count=state.step_count * keeps,
-        episode_reward=torch.where(mask, nothing, state.episode_reward),
-        reward=reward,
-        paid=torch.where(mask, nothing, state.paid) if uses.step_reward else reward,
-    )
 
 
 def _count_episode(state: RowState, mask: Tensor, params: RowParams) -> RowState:

@@ -39,7 +39,13 @@ def image_figure(task: Task, seed: int = 0) -> Any:
     """
     x = task.observations
     varies = x.read_noise or x.read_rotation or task.images.num_variants > 1
-    lines = _make_varied_lines(task, seed) if varies else _make_plain_lines(task)
+    if varies:
+        lines = _make_varied_lines(task, seed)
+    else:
+        lines = []
+        for kind in StateType:
+            ids = _first_ids(task, kind, COLUMNS)
+            lines.append(ImageLine(kind.name.lower(), _stored(task, ids), list(map(str, ids))))
     figure = new_figure(INCHES * COLUMNS + 1.0, INCHES * ROW * len(lines) + 0.5)
     axes = figure.subplots()
     for row, line in enumerate(lines):
@@ -49,14 +55,6 @@ def image_figure(task: Task, seed: int = 0) -> Any:
     noise = f"noise 0..{x.read_noise}, rotation 0..{x.read_rotation} degrees on read"
     figure.suptitle(f"{task.images.num_images:,} images, {noise if varies else 'nothing varies on read'}", fontsize=9)
     return figure
-
-
-def _make_plain_lines(task: Task) -> list[ImageLine]:
-    lines = []
-    for kind in StateType:
-        ids = _first_ids(task, kind, COLUMNS)
-        lines.append(ImageLine(kind.name.lower(), _stored(task, ids), list(map(str, ids))))
-    return lines
 
 
 def _make_varied_lines(task: Task, seed: int) -> list[ImageLine]:

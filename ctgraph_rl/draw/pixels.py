@@ -93,14 +93,27 @@ def render(
     _show(pictures[:, :, :size], observation.detach().cpu().numpy())
     states = zip(state_type.tolist(), node.tolist(), goal_leaf.tolist(), strict=True)
     for picture, task, state in zip(pictures, tasks, states, strict=True):
-        picture[:, size:] = _to_rgb(_draw_row(task, *state, size))
+        canvas = _draw_row(task, *state, size)
+        packed = np.pad(PALETTE, ((0, 0), (0, 1))).view(np.uint64)[:, 0]
+        parts = packed[canvas].reshape(len(canvas) // SCALE, SCALE, -1, SCALE)
+        total = parts[:, 0, :, 0] + parts[:, 0, :, 1] + parts[:, 1, :, 0] + parts[:, 1, :, 1]
+        channels = total.view(np.uint16).reshape(*total.shape, 4)[..., :3]
+        picture[:, size:] = (channels // SCALE**2).astype(np.uint8)
     return torch.from_numpy(pictures)
 
 
 def _show(panels: Pixels, observation: Pixels) -> None:
     one_hot = observation.ndim == 2
     size = panels.shape[1]
-    images = _grid(observation) if one_hot else observation[:, 0]
+    if one_hot:
+        n, entries = observation.shape
+        columns = math.ceil(math.sqrt(entries))
+        rows = math.ceil(entries / columns)
+        grid = np.full((n, rows * columns), PANEL_GREY, np.uint8)
+        grid[:, :entries] = np.where(observation != 0, 255, OFF_GREY)
+        images = grid.reshape(n, rows, columns)
+    else:
+        images = observation[:, 0]
     room = size - 2 * (size // 16)
     longest = max(images.shape[1:])
     for axis, length in enumerate(images.shape[1:], 1):
@@ -117,15 +130,6 @@ def _show(panels: Pixels, observation: Pixels) -> None:
     panels[:, top : top + height, left : left + width] = images[..., None]
 
 
-def _grid(vectors: Pixels) -> Pixels:
-    n, entries = vectors.shape
-    columns = math.ceil(math.sqrt(entries))
-    rows = math.ceil(entries / columns)
-    grid = np.full((n, rows * columns), PANEL_GREY, np.uint8)
-    grid[:, :entries] = np.where(vectors != 0, 255, OFF_GREY)
-    return grid.reshape(n, rows, columns)
-
-
 def _draw_row(task: Task, kind: int, node: int, goal_leaf: int, size: int) -> Pixels:
     graph = task.graph
     unit = size / 192
@@ -139,7 +143,16 @@ def _draw_row(task: Task, kind: int, node: int, goal_leaf: int, size: int) -> Pi
     place = marks[shown_kind if failed else StateType(kind), node]
     way = [marks[DECISION, passed] for passed in graph.nodes_to(node)[:-1]]
     _lines(canvas, pairwise([marks[HOME_KEY], *way, place]), 2 * unit, WAY)
-    _star(canvas, marks[END, goal], unit)
+    mark = marks[END, goal]
+    x = mark.x
+    y = mark.y + mark.radius + 10.5 * unit
+    reach = 5.5 * unit
+    points = []
+    for k in range(6):
+        turn = 0.8 * math.pi * k
+        points.append(Mark(x + reach * math.sin(turn), y - reach * math.cos(turn), 0))
+    _lines(canvas, pairwise(points), 1.5 * unit, GOAL)
+    _discs(canvas, [Mark(x, y, 2 * unit)], GOAL)
     swap = marks.get((DECISION, -1 if task.swapped_node is None else task.swapped_node))
     if swap is not None:
         _cross(canvas, swap, 0.6 * swap.radius, unit, OUTLINE)
@@ -166,7 +179,7 @@ def _picture(graph: CTGraph, size: int, nodes: tuple[int, ...]) -> tuple[Pixels,
         mark = Mark(x * size, home.y + gap * (level + 1), radius)
         above = marks[DECISION, graph.parent(node)] if node else home
         marks[layout.kind(node), node] = mark
-        marks[WAIT, node] = _middle(above, mark)
+        marks[WAIT, node] = Mark((above.x + mark.x) / 2, (above.y + mark.y) / 2, 0.6 * min(above.radius, mark.radius))
         edges.append((above, mark))
     stubs = []
     for node, x in layout.stubs:
@@ -182,27 +195,11 @@ def _picture(graph: CTGraph, size: int, nodes: tuple[int, ...]) -> tuple[Pixels,
     return canvas, marks
 
 
-def _middle(a: Mark, z: Mark) -> Mark:
-    return Mark((a.x + z.x) / 2, (a.y + z.y) / 2, 0.6 * min(a.radius, z.radius))
-
-
 def _cross(canvas: Pixels, mark: Mark, reach: float, width: float, colour: int) -> None:
     lines = []
     for x in (-reach, reach):
         lines.append((Mark(mark.x - x, mark.y - reach, 0), Mark(mark.x + x, mark.y + reach, 0)))
     _lines(canvas, lines, width, colour)
-
-
-def _star(canvas: Pixels, mark: Mark, unit: float) -> None:
-    x = mark.x
-    y = mark.y + mark.radius + 10.5 * unit
-    reach = 5.5 * unit
-    points = []
-    for k in range(6):
-        turn = 0.8 * math.pi * k
-        points.append(Mark(x + reach * math.sin(turn), y - reach * math.cos(turn), 0))
-    _lines(canvas, pairwise(points), 1.5 * unit, GOAL)
-    _discs(canvas, [Mark(x, y, 2 * unit)], GOAL)
 
 
 @lru_cache(maxsize=1024)
@@ -238,11 +235,3 @@ def _lines(canvas: Pixels, lines: Iterable[MarkLine], width: float, colour: int)
     steps = math.ceil(SCALE * abs(way).max()) + 1
     points = start + np.linspace(0, 1, steps)[:, None, None] * way
     _fill(canvas, points.reshape(-1, 2), _ring(-1, width / 2), colour)
-
-
-def _to_rgb(canvas: Pixels) -> Pixels:
-    packed = np.pad(PALETTE, ((0, 0), (0, 1))).view(np.uint64)[:, 0]
-    parts = packed[canvas].reshape(len(canvas) // SCALE, SCALE, -1, SCALE)
-    total = parts[:, 0, :, 0] + parts[:, 0, :, 1] + parts[:, 1, :, 0] + parts[:, 1, :, 1]
-    channels = total.view(np.uint16).reshape(*total.shape, 4)[..., :3]
-    return (channels // SCALE**2).astype(np.uint8)

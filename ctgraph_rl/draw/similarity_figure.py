@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from torch import Tensor
 
 from ctgraph_rl.draw.style import new_figure, save_figure
 from ctgraph_rl.log.escape import figure_text
@@ -37,25 +36,20 @@ def draw_similarity(curriculum: Curriculum, path: Path | str) -> None:
     figure.suptitle(f"{figure_text(curriculum.name)}: similarity of {len(tasks)} tasks")
     *panels, last = figure.subplots(2, 3).flat
     for axes, (title, measure) in zip(panels, MEASURES.items(), strict=True):
-        image = _draw_matrix(axes, measure(tasks), title)
+        matrix = measure(tasks).numpy()
+        axes.set_facecolor("white")
+        axes.patch.set(hatch="////", edgecolor="grey")
+        image = axes.imshow(matrix, cmap="Greys", vmin=0, vmax=1)
+        axes.set_title(title, fontsize=9)
+        for (i, j), value in np.ndenumerate(matrix):
+            if len(matrix) <= MOST_NUMBERS and not np.isnan(value):
+                ink = "white" if value > 0.6 else "black"
+                number = axes.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color=ink)
+                number.set_in_layout(False)  # it is within the panel
         _draw_labels(axes, curriculum.labels, is_lowest=axes in panels[2:], is_leftmost=axes in panels[::3])
     last.axis("off")
     figure.colorbar(image, ax=last, location="left", shrink=0.8, label="share; hatched: nothing to compare")
     save_figure(figure, path)
-
-
-def _draw_matrix(axes: Any, matrix: Tensor, title: str) -> Any:
-    axes.set_facecolor("white")
-    axes.patch.set(hatch="////", edgecolor="grey")
-    image = axes.imshow(matrix.numpy(), cmap="Greys", vmin=0, vmax=1)
-    axes.set_title(title, fontsize=9)
-    if len(matrix) <= MOST_NUMBERS:
-        for (i, j), value in np.ndenumerate(matrix.numpy()):
-            ink = "white" if value > 0.6 else "black"
-            if not np.isnan(value):
-                number = axes.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color=ink)
-                number.set_in_layout(False)  # it is within the panel
-    return image
 
 
 def _draw_labels(axes: Any, labels: Sequence[str], is_lowest: bool, is_leftmost: bool) -> None:

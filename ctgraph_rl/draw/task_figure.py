@@ -103,7 +103,12 @@ class _TaskPicture:
         self.layout = lay_out(self.graph, [self.goal, *most_visited])
         self.waits = self.layout.is_whole or self.graph.depth <= MOST_WAIT_LEVELS
         self.places = {state: self._place(state) for state in self.layout.states(self.waits)}
-        self.size, beside = self._sizes()
+        box = self.axes.get_window_extent()
+        points = 72 / self.axes.figure.dpi
+        beside = points * box.width / len(self.layout.leaves)
+        below = points * box.height / (self.height + 2)
+        share = 0.52 if beside >= ROOM else 0.75
+        self.size = max(2.0, min(LARGEST_MARK, share * beside, 0.55 * below))
         self.has_room = beside >= ROOM
         self.has_numbers = beside >= ROOM_FOR_NUMBERS
 
@@ -121,20 +126,15 @@ class _TaskPicture:
         """Rows of states below home."""
         return -min(y for _, y in self.places.values())
 
-    def _sizes(self) -> tuple[float, float]:
-        box = self.axes.get_window_extent()
-        points = 72 / self.axes.figure.dpi
-        beside = points * box.width / len(self.layout.leaves)
-        below = points * box.height / (self.height + 2)
-        share = 0.52 if beside >= ROOM else 0.75
-        return max(2.0, min(LARGEST_MARK, share * beside, 0.55 * below)), beside
-
     def draw(self, legend: bool) -> None:
         self._draw_edges()
         self._draw_states()
         self._draw_goal()
         if self.has_room:
-            self._draw_loops()
+            if self.graph.wait_prob > 0:
+                points = [place for (kind, _), place in self.places.items() if kind == WAIT]
+                ring = RING | {"markersize": 0.7 * self.size, "transform": self._moved(x=-0.55 * self.size)}
+                self.axes.plot(*zip(*points, strict=True), zorder=2, **ring)
             self._draw_ways_to_fail()
         title = f"{shape_of(self.graph)}, goal {write_short(self.task.goal)}"
         if not self.layout.is_whole:
@@ -160,8 +160,13 @@ class _TaskPicture:
         nodes = {node: place for (kind, node), place in self.places.items() if kind == DECISION}
         draw_lines(self.axes, stub_lines(self.layout, nodes, 0.7 * row), colors=GREY, linewidths=0.8)
         if self.has_room:
-            for edge, line in zip(found, lines, strict=True):
-                self._write_at_edge(edge, line)
+            for edge, ((x, y), (end_x, end_y)) in zip(found, lines, strict=True):
+                if edge.action is not None:
+                    numbers = self._numbers(edge.start, (edge.action,))
+                    words = f"{edge.action}" + (f": {numbers}" if numbers else "")
+                    box = {"facecolor": "1", "edgecolor": "none", "pad": 0.6}
+                    middle = (x + 0.55 * (end_x - x), y + 0.55 * (end_y - y))
+                    self.axes.text(*middle, words, fontsize=6.5, ha="center", va="center", bbox=box, zorder=2)
 
     def _is_strong(self, edge: Edge) -> bool:
         chances = self.policy.get(edge.start)
@@ -177,24 +182,6 @@ class _TaskPicture:
         if edge.start in self.policy and edge.action is not None:
             return 0.8 + 2 * self.policy[edge.start][edge.action]
         return 1.6 if self._is_strong(edge) else 0.8
-
-    def _write_at_edge(self, edge: Edge, line: Sequence[PlanePoint]) -> None:
-        if edge.action is None:
-            return
-        numbers = self._numbers(edge.start, (edge.action,))
-        (x, y), (end_x, end_y) = line
-        words = f"{edge.action}" + (f": {numbers}" if numbers else "")
-        box = {"facecolor": "1", "edgecolor": "none", "pad": 0.6}
-        self.axes.text(
-            x + 0.55 * (end_x - x),
-            y + 0.55 * (end_y - y),
-            words,
-            fontsize=6.5,
-            ha="center",
-            va="center",
-            bbox=box,
-            zorder=2,
-        )
 
     def _numbers(self, state: Key, actions: Sequence[int]) -> str:
         if not self.has_numbers:
@@ -236,12 +223,6 @@ class _TaskPicture:
             path = write_short(self.graph.path(end))
             self._note(path, self.places[END, end], under, fontsize=6, ha="center", va="top")
 
-    def _draw_loops(self) -> None:
-        if self.graph.wait_prob > 0:
-            points = [place for (kind, _), place in self.places.items() if kind == WAIT]
-            ring = RING | {"markersize": 0.7 * self.size, "transform": self._moved(x=-0.55 * self.size)}
-            self.axes.plot(*zip(*points, strict=True), zorder=2, **ring)
-
     def _moved(self, x: float = 0.0, y: float = 0.0) -> Any:
         from matplotlib.transforms import offset_copy
 
@@ -251,7 +232,10 @@ class _TaskPicture:
         base = {"arrowstyle": "<|-", "linestyle": DASHES, "color": colour(FAIL), "shrinkB": 0, "mutation_scale": 6}
         for (kind, node), place in self.places.items():
             if kind in (WAIT, DECISION):
-                wrong = self._wrong((kind, node))
+                b = self.graph.branching_factor
+                right = (WAIT_ACTION,) if kind == WAIT else range(1, b + 1)
+                most = max(b + 1, len(self.policy.get((kind, node), ())), len(self.values.get((kind, node), ())))
+                wrong = [action for action in range(most) if action not in right]
                 arrow = base | {"linewidth": 0.8 + 2 * sum(_pick(self.policy.get((kind, node), ()), wrong))}
                 self._note("", place, (1.1 * self.size, 0), arrowprops=arrow, zorder=2)
                 numbers = self._numbers((kind, node), wrong)
@@ -259,12 +243,6 @@ class _TaskPicture:
                 beside = "top" if kind == WAIT else "bottom"
                 shift = (0.55 * self.size, 3 * side)
                 self._note(numbers, place, shift, va=beside, fontsize=6, color=colour(FAIL))
-
-    def _wrong(self, state: Key) -> list[int]:
-        b = self.graph.branching_factor
-        right = (WAIT_ACTION,) if state[0] == WAIT else range(1, b + 1)
-        most = max(b + 1, len(self.policy.get(state, ())), len(self.values.get(state, ())))
-        return [action for action in range(most) if action not in right]
 
     def _note(self, words: str, place: PlanePoint, shift: PlanePoint, **style: Any) -> None:
         self.axes.annotate(words, place, xytext=shift, textcoords="offset points", **style)
@@ -279,30 +257,26 @@ class _TaskPicture:
             marks.append(Line2D([], [], label="a wrong action", color=colour(FAIL), linestyle=DASHES, linewidth=1))
         if self.has_room and self.graph.wait_prob > 0:
             marks.append(Line2D([], [], label="stays with p", markersize=6, **RING))
-        self.axes.legend(
-            handles=marks,
-            ncols=math.ceil(len(marks) / math.ceil(LEGEND_WIDTH / self._room())),
-            loc="upper center",
-            bbox_to_anchor=(0.5, 0.02),
-            fontsize=7,
-            frameon=False,
-            title=self._meaning(),
-            title_fontsize=7,
-            handletextpad=0.3,
-            columnspacing=1.0,
-        )
-
-    def _room(self) -> float:
         spec = self.axes.get_subplotspec()
-        return float(self.axes.figure.get_figwidth() / (1 if spec is None else spec.get_gridspec().ncols))
-
-    def _meaning(self) -> str:
+        width = self.axes.figure.get_figwidth() / (1 if spec is None else spec.get_gridspec().ncols)
         nodes = "visits" if self.visits else "observation ids" if self.ids else ""
         numbers = ["probability"] if self.policy and self.has_numbers else []
         numbers += ["Q"] if self.values and self.has_numbers else []
         at_edges = f"at edges: {', '.join(['action', *numbers])}" if self.has_room else ""
         black = "black: the likeliest action" if self.policy else ""
-        return "; ".join(filter(None, [f"in nodes: {nodes}" if nodes else "", at_edges, black]))
+        meaning = "; ".join(filter(None, [f"in nodes: {nodes}" if nodes else "", at_edges, black]))
+        self.axes.legend(
+            handles=marks,
+            ncols=math.ceil(len(marks) / math.ceil(LEGEND_WIDTH / width)),
+            loc="upper center",
+            bbox_to_anchor=(0.5, 0.02),
+            fontsize=7,
+            frameon=False,
+            title=meaning,
+            title_fontsize=7,
+            handletextpad=0.3,
+            columnspacing=1.0,
+        )
 
 
 def _probabilities(choice: Any, branching_factor: int) -> list[float]:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_real, require
+from ctgraph_rl.checks import NamedValues, is_real, require
 from ctgraph_rl.disk import read_regular
 from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG, METRICS
 from ctgraph_rl.log.measurement import LARGEST
@@ -28,12 +28,13 @@ def damaged(run_dir: Path) -> list[str]:
         return [METRICS]
     if sums is None:
         return [name for name, check in _CHECKS.items() if not _is_readable(run_dir / name, check)]
-    return [name for name in sums if not _is_same(run_dir / name, sums[name])]
-
-
-def _is_same(path: Path, stored: ReadOnlyValues) -> bool:
-    there = path.is_file() and path.stat().st_size == stored["bytes"]
-    return there and sha256_of(path, MOST_BYTES_OF_A_FILE) == stored["sha256"]
+    found = []
+    for name, stored in sums.items():
+        path = run_dir / name
+        there = path.is_file() and path.stat().st_size == stored["bytes"]
+        if not there or sha256_of(path, MOST_BYTES_OF_A_FILE) != stored["sha256"]:
+            found.append(name)
+    return found
 
 
 def _is_log(path: Path) -> bool:

@@ -145,7 +145,10 @@ class RunLog:
         Raises:
             OSError: if it cannot be written, or the file was moved.
         """
-        finite = {name: _finite(value) for name, value in values.items()}
+        finite = {
+            name: (None if isinstance(value, float) and not math.isfinite(value) else value)
+            for name, value in values.items()
+        }
         measurement = {"kind": kind, **finite, "seconds": round(time.perf_counter() - self._start, 3)}
         self.measurements.append(measurement)
         if self._path is not None:
@@ -440,7 +443,3 @@ def tuning_share(about: ReadOnlyValues) -> float | None:
 
 def _row(values: Sequence[float | None]) -> Tensor:
     return torch.tensor([math.nan if value is None else value for value in values], dtype=torch.float64, device="cpu")
-
-
-def _finite(value: Any) -> Any:
-    return None if isinstance(value, float) and not math.isfinite(value) else value

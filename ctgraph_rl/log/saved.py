@@ -52,16 +52,7 @@ def read_plain(content: bytes) -> Any:
         value = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
     except Exception as error:  # what a pickle that others made may raise is without end
         raise ValueError("holds more than tensors and plain values, or is torn") from error
-    _require_small(value, len(content))
-    return value
-
-
-def _require_small(value: Any, num_bytes: int) -> None:
-    """Refuse values that are small in the file and large in use: repeated parts and long strides.
-
-    Raises:
-        ValueError: for more parts than the file has bytes, and tensors beyond this machine's memory.
-    """
+    num_bytes = len(content)
     parts = [value]
     count = 0
     total = 0
@@ -79,6 +70,7 @@ def _require_small(value: Any, num_bytes: int) -> None:
         (count <= num_bytes, f"has more parts than its {num_bytes:,} bytes, as some stand in many places"),
         (total <= most, f"has tensors of {total:,} bytes, the limit is {most:,}"),
     )
+    return value
 
 
 def without_moments(state: Any) -> Any:
@@ -136,7 +128,21 @@ def require_records(content: bytes) -> None:
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as records:
             listed = records.infolist()
-            _check_sizes(content, listed)
+            end = len(content) - 22
+            large = content[end - 20 : end - 16] == b"PK\x06\x07"
+            one_list = (
+                content[end : end + 4] == b"PK\x05\x06"
+                and content[-2:] == b"\0\0"
+                and (not large or struct.unpack_from("<Q", content, end - 12)[0] == end - 76)
+                and min((record.header_offset for record in listed), default=0) == 0
+            )
+            stored = all(record.compress_type == zipfile.ZIP_STORED for record in listed)
+            total = sum(max(record.file_size, record.compress_size) for record in listed)
+            require(
+                (one_list, "is no archive of torch.save, whose records begin at its start and are listed at its end"),
+                (stored, "has compressed records, which torch.save does not write"),
+                (total <= len(content), f"says that its records have {total:,} bytes, and has {len(content):,}"),
+            )
             pickles = [records.read(record) for record in listed if record.filename.endswith("/data.pkl")]
         require((len(pickles) == 1, "holds more than tensors and plain values, or is torn"))
         names = list(_names(pickles[0]))
@@ -144,24 +150,6 @@ def require_records(content: bytes) -> None:
         raise ValueError("holds more than tensors and plain values, or is torn") from error
     other = [name for name, follows in names if not _GLOBALS.fullmatch(name) or follows != _FOLLOWS.get(name, follows)]
     require((not other, f"holds more than tensors and plain values: {', '.join(other[:3])!r:.80}"))
-
-
-def _check_sizes(content: bytes, records: list[zipfile.ZipInfo]) -> None:
-    end = len(content) - 22
-    large = content[end - 20 : end - 16] == b"PK\x06\x07"
-    one_list = (
-        content[end : end + 4] == b"PK\x05\x06"
-        and content[-2:] == b"\0\0"
-        and (not large or struct.unpack_from("<Q", content, end - 12)[0] == end - 76)
-        and min((record.header_offset for record in records), default=0) == 0
-    )
-    stored = all(record.compress_type == zipfile.ZIP_STORED for record in records)
-    total = sum(max(record.file_size, record.compress_size) for record in records)
-    require(
-        (one_list, "is no archive of torch.save, whose records begin at its start and are listed at its end"),
-        (stored, "has compressed records, which torch.save does not write"),
-        (total <= len(content), f"says that its records have {total:,} bytes, and has {len(content):,}"),
-    )
 
 
 def _names(pickled: bytes) -> Iterator[tuple[str, str]]:

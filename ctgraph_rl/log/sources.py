@@ -183,7 +183,9 @@ def _defined(statement: ast.stmt) -> Iterator[str]:
         return
     for node in ast.walk(statement):
         if isinstance(node, (ast.Attribute, ast.Subscript)) and isinstance(node.ctx, ast.Store):
-            root = _root(node)
+            root: ast.expr = node
+            while isinstance(root, (ast.Attribute, ast.Subscript)):
+                root = root.value
             if isinstance(root, ast.Name):
                 yield root.id
         if isinstance(node, ast.alias):
@@ -192,12 +194,6 @@ def _defined(statement: ast.stmt) -> Iterator[str]:
             yield node.id
         elif isinstance(node, DEFINITIONS):
             yield node.name
-
-
-def _root(node: ast.expr) -> ast.expr:
-    while isinstance(node, (ast.Attribute, ast.Subscript)):
-        node = node.value
-    return node
 
 
 def _imports(tree: ast.AST, package: str) -> Iterator[str]:

@@ -164,7 +164,11 @@ def picture(observation: NDArray[np.uint8], white: float, colours: bool) -> Text
         image = np.pad(observation, (0, -len(observation) % columns)).reshape(-1, columns)
     levels = np.clip(image.astype(int) * 255 // int(white), 0, 255)
     times = max(1, WIDTH // levels.shape[1])
-    return _blocks(levels.repeat(times, 0).repeat(times, 1)) if colours else _shades(levels, max(1, times // 2))
+    if colours:
+        return _blocks(levels.repeat(times, 0).repeat(times, 1))
+    times = max(1, times // 2)
+    shown = (levels * len(SHADES) // 256).repeat(times, 0).repeat(2 * times, 1)
+    return Text("\n".join("".join(SHADES[level] for level in line) for line in shown.tolist()) + "\n")
 
 
 def _blocks(levels: NDArray[np.int_]) -> Text:
@@ -175,11 +179,6 @@ def _blocks(levels: NDArray[np.int_]) -> Text:
             text.append("▀", Style(color=f"rgb({high},{high},{high})", bgcolor=f"rgb({low},{low},{low})"))
         text.append("\n")
     return text
-
-
-def _shades(levels: NDArray[np.int_], times: int) -> Text:
-    shown = (levels * len(SHADES) // 256).repeat(times, 0).repeat(2 * times, 1)
-    return Text("\n".join("".join(SHADES[level] for level in line) for line in shown.tolist()) + "\n")
 
 
 @contextmanager

@@ -89,19 +89,16 @@ def score_of(results: Sequence[Measured], controls: Sequence[str] = ()) -> Score
     value = min(max((measured - floor) / (optimum - floor), 0.0), 1.0)
     low = high = None
     if len(results) > 1:
-        found = _exact_interval(results) if results[0].exact else _paired_interval(results)
+        if results[0].exact:  # one floor and optimum of all seeds
+            room = optimum - floor
+            scores = [(each.value - floor) / room for each in results]
+            found = gaffke(scores, Bounds(-floor / room, (results[0].highest - floor) / room), LEVEL)
+        else:
+            found = _paired_interval(results)
         low = min(max(found[0], 0.0), value)
         high = max(min(found[1], 1.0), value)
     said = ", ".join(f"{name} {mean:.2f}" for name, mean in zip(controls, means, strict=False))
     return Score(value, low, high, len(results), measured=measured, floor=floor, optimum=optimum, controls=said)
-
-
-def _exact_interval(results: Sequence[Measured]) -> tuple[float, float]:
-    """Return Gaffke's interval of the mean score, for one floor and optimum of all seeds."""
-    [floor] = results[0].floors
-    room = results[0].optimum - floor
-    scores = [(each.value - floor) / room for each in results]
-    return gaffke(scores, Bounds(-floor / room, (results[0].highest - floor) / room), LEVEL)
 
 
 def _paired_interval(results: Sequence[Measured]) -> tuple[float, float]:

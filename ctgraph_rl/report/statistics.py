@@ -307,7 +307,11 @@ def interquartile_mean(
         added = [bound] if math.isfinite(bound) else []
         tasks = [[*task, *added] for task in known]
         weights = [rng.dirichlet(np.ones(len(task)), resamples) / len(tasks) for task in tasks]
-        limits.append(float(np.quantile(_middle_mean(np.concatenate(tasks), np.concatenate(weights, axis=1)), tail)))
+        together = np.concatenate(tasks)
+        order = np.argsort(together)
+        below = np.cumsum(np.concatenate(weights, axis=1)[:, order], axis=1).clip(0.25, 0.75)
+        parts = np.diff(below, axis=1, prepend=0.25)  # of the middle half
+        limits.append(float(np.quantile(2 * parts @ together[order], tail)))
     pooled = np.sort(np.concatenate(known))
     cut = len(pooled) // 4
     value = float(pooled[cut : len(pooled) - cut].mean())
@@ -448,13 +452,6 @@ def _sign_flip(differences: Sequence[float]) -> float:
         signs[0] = 1
     sums = np.abs(signs @ np.array(differences))
     return float((sums >= sums[0] * (1 - ROUNDING)).mean())
-
-
-def _middle_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    order = np.argsort(values)
-    below = np.clip(np.cumsum(weights[:, order], axis=1), 0.25, 0.75)
-    parts = np.diff(below, axis=1, prepend=0.25)
-    return 2 * parts @ values[order]
 
 
 def _known(values: Values) -> tuple[list[float], int]:

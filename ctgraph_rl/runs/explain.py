@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
@@ -62,7 +61,14 @@ def explain(error: BaseException, cfg: DictConfig | None = None) -> str:
         return as_typed(str(cause).strip(), _unresolved(cfg), typed)
     if isinstance(cause, MissingConfigException) and cause.missing_cfg_file:
         group, _, name = cause.missing_cfg_file.rpartition("/")
-        return _unknown_file(group, name, cause.options or ())
+        choices = cause.options or ()
+        extra = LAUNCHERS.get(f"{group}/{name}")
+        if extra is not None:
+            return f"this launcher is another package: pip install 'ctgraph_rl[{extra}]'"
+        is_long = len(choices) > MOST_CHOICES and nearest(name, choices) is None
+        listed = "ctgraph-rl curricula lists those with names, and axes and graph make others"
+        hint = listed if is_long else did_you_mean(name, choices)
+        return f"unknown {group or 'configuration'} {name!r}: {hint}"
     if isinstance(cause, OverrideParseException):
         is_value = "=" in str(cause.override)
         how = "quote a value with brackets, commas or spaces" if is_value else "settings are written as in seed=1"
@@ -113,16 +119,6 @@ def _why_unresolved(message: str, raw: str) -> str:
     if "nvironment variable" in why:
         return f"{why}; set it, or write what it is where it is not set, {raw.replace('}', ',VALUE}', 1)}"
     return f"{why}; write the value itself"
-
-
-def _unknown_file(group: str, name: str, choices: Sequence[str]) -> str:
-    extra = LAUNCHERS.get(f"{group}/{name}")
-    if extra is not None:
-        return f"this launcher is another package: pip install 'ctgraph_rl[{extra}]'"
-    is_long = len(choices) > MOST_CHOICES and nearest(name, choices) is None
-    listed = "ctgraph-rl curricula lists those with names, and axes and graph make others"
-    hint = listed if is_long else did_you_mean(name, choices)
-    return f"unknown {group or 'configuration'} {name!r}: {hint}"
 
 
 def _unknown_setting(asked: str, node: DictConfig) -> str:

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any
@@ -67,7 +67,12 @@ class Interrupt:
         if callable(requeue):
             with _deaf():
                 if not _is_being_ended():
-                    _put_into_queue(requeue)
+                    try:
+                        requeue(_requeuing(), None)
+                    except (OSError, subprocess.SubprocessError) as error:
+                        if not _is_in_queue():
+                            said = f"SLURM did not put job {_job()} into the queue again, as scontrol requeue failed"
+                            raise RuntimeError(f"{said}: the same command resumes the run") from error
         raise SystemExit(128 + self.signal)
 
     def _ask(self, number: int, frame: FrameType | None) -> None:
@@ -95,16 +100,6 @@ def _deaf() -> Iterator[None]:
         for number, handler in before.items():
             if handler is not None:  # it was not set by Python
                 signal.signal(number, handler)
-
-
-def _put_into_queue(requeue: Callable[[int, FrameType | None], object]) -> None:
-    try:
-        requeue(_requeuing(), None)
-    except (OSError, subprocess.SubprocessError) as error:
-        if not _is_in_queue():
-            fix = "the same command resumes the run"
-            said = f"SLURM did not put job {_job()} into the queue again, as scontrol requeue failed: {fix}"
-            raise RuntimeError(said) from error
 
 
 def _is_being_ended() -> bool:

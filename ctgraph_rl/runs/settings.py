@@ -199,17 +199,13 @@ def differences(stored: ReadOnlyValues, given: ReadOnlyValues) -> list[str]:
     now = dict(flat(as_before(given)))
     found = []
     for key in sorted({*before, *now}):
-        added = _value_before(key, given)
+        group, _, name = key.partition(".")
+        added = dict(flat(_added_to(given.get(group)))).get(name, ADDED.get("run", {}).get(key))
         old = before.get(key, added)
         new = now.get(key, added)
         if old != new:
             found.append(f"{key}={old!r} instead of {new!r}")
     return found
-
-
-def _value_before(key: str, given: ReadOnlyValues) -> Any:
-    group, _, name = key.partition(".")
-    return dict(flat(_added_to(given.get(group)))).get(name, ADDED.get("run", {}).get(key))
 
 
 def in_digits(arguments: Sequence[str]) -> list[str]:

@@ -15,7 +15,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override, OverrideType, ValueType
+from hydra.core.override_parser.types import OverrideType, ValueType
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException
 from hydra.types import HydraContext, TaskFunction
@@ -170,19 +170,18 @@ class Sweeper(Base):
         overrides = parser.parse_overrides([*self._parse_config(), *own, *arguments])
         for each in overrides:
             if each.value_type == ValueType.GLOB_CHOICE_SWEEP:
-                self._check_glob(each)
+                assert self.hydra_context is not None
+                group = each.key_or_group
+                names = self.hydra_context.config_loader.get_group_options(group)
+                given = each.input_line
+                values = (
+                    f"{given}: glob chooses files of a group, such as agent or method; {group} has values, such as 1,2"
+                )
+                require((bool(names), values))
+                require((any(each.sweep_iterator()), f"{given} matches none of {', '.join(names)}"))
         batch: list[list[str]]
         [batch] = self.split_arguments(overrides, None)
         return batch
-
-    def _check_glob(self, parsed: Override) -> None:
-        assert self.hydra_context is not None
-        group = parsed.key_or_group
-        names = self.hydra_context.config_loader.get_group_options(group)
-        given = parsed.input_line
-        values = f"{given}: glob chooses files of a group, such as agent or method; {group} has values, such as 1,2"
-        require((bool(names), values))
-        require((any(parsed.sweep_iterator()), f"{given} matches none of {', '.join(names)}"))
 
     def _status(self, folder: Path, before: RunOutcome, error: str | None) -> Status:
         found = status_of(folder, before, error)

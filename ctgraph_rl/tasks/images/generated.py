@@ -109,18 +109,6 @@ class GroupedImages(SquareImages):
         cells = self.cells if is_int(self.cells, 1) else 1
         most = WHITE * cells**2 // 2  # half the images that differ from a blueprint in one cell
         wanted = len(groups) * max(groups) if groups_ok else 0
-        require(
-            (groups_ok, f"groups must be the numbers of images of each group, >= 1, got {groups!r}"),
-            *at_least_one(cells=self.cells),
-            _seed_rule(self.seed),
-            _size_rule(self.size, cells),
-            (wanted <= most, f"groups need {wanted} images, more than {most}; use more cells"),
-            *self._distance_rules(),
-        )
-        object.__setattr__(self, "within", float(self.within))
-        object.__setattr__(self, "between", float(self.between))
-
-    def _distance_rules(self) -> list[Rule]:
         lowest = UNRELATED * (1 - (1 - 1 / self.cells**2) ** 2) if is_int(self.cells, 1) else 0.0
         within_ok = is_real(self.within, lowest, UNRELATED)
         reach = f"[{math.ceil(lowest * 1e5) / 1e5:.5f}, {UNRELATED:.5f}]"
@@ -128,10 +116,17 @@ class GroupedImages(SquareImages):
             enough = math.ceil((1 - math.sqrt(1 - self.within / UNRELATED)) ** -0.5)
             reach += f" for cells={self.cells} (use cells={enough} or more)"
         between_ok = is_real(self.between, self.within if within_ok else lowest, UNRELATED)
-        return [
+        require(
+            (groups_ok, f"groups must be the numbers of images of each group, >= 1, got {groups!r}"),
+            *at_least_one(cells=self.cells),
+            _seed_rule(self.seed),
+            _size_rule(self.size, cells),
+            (wanted <= most, f"groups need {wanted} images, more than {most}; use more cells"),
             (within_ok, f"within must be in {reach}, got {self.within!r}"),
             (between_ok, f"between must be in [within, {UNRELATED:.5f}], got {self.between!r}"),
-        ]
+        )
+        object.__setattr__(self, "within", float(self.within))
+        object.__setattr__(self, "between", float(self.between))
 
     @property
     def num_images(self) -> int:
@@ -159,7 +154,13 @@ def _paper_images(image_set: PaperImages) -> Tensor:
     while images is None or len(images) < image_set.num_images:
         needed = candidates * (_BYTES_OF_A_PIXEL * image_set.size**2 + _BYTES_OF_A_BLUEPRINT)
         require_memory(f"{image_set.num_images:,} images while they are made", needed, "images")
-        rendered = _render(_blueprints(image_set.seed, candidates), image_set.size)
+        blueprints = _blueprints(image_set.seed, candidates)
+        levels = torch.tensor(BLUEPRINT_LEVELS, dtype=torch.uint8, device="cpu")[blueprints[:, :-1]]
+        rendered = resize(levels.view(-1, BLUEPRINT_SIZE, BLUEPRINT_SIZE), image_set.size)
+        for which, angle in enumerate(BLUEPRINT_ANGLES):
+            chosen = blueprints[:, -1] == which
+            parts = rendered[chosen].split(_ROTATED_AT_ONCE)
+            rendered[chosen] = torch.cat([rotate(part, angle) for part in parts])
         images = rendered[first_of_each(rendered)]
         candidates *= 2
     return images[: image_set.num_images].clone()
@@ -171,16 +172,6 @@ def _blueprints(seed: int, count: int) -> Tensor:
     words = draw(tick.new_tensor(seed), tick.new_tensor(0), tick, STREAM_IMAGES)
     powers = 3 ** torch.arange(BLUEPRINT_SIZE**2 + 1, device="cpu")
     return ((words[0] << 31) | (words[1] >> 1)).unsqueeze(-1) // powers % 3
-
-
-def _render(blueprints: Tensor, size: int) -> Tensor:
-    levels = torch.tensor(BLUEPRINT_LEVELS, dtype=torch.uint8, device="cpu")[blueprints[:, :-1]]
-    images = resize(levels.view(-1, BLUEPRINT_SIZE, BLUEPRINT_SIZE), size)
-    for which, angle in enumerate(BLUEPRINT_ANGLES):
-        chosen = blueprints[:, -1] == which
-        parts = images[chosen].split(_ROTATED_AT_ONCE)
-        images[chosen] = torch.cat([rotate(part, angle) for part in parts])
-    return images
 
 
 @lru_cache(maxsize=64)

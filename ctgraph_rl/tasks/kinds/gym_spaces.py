@@ -65,7 +65,15 @@ class ObservationForm:
             self.shape: tuple[int, ...] = (int(space.n),)
             self.dtype: Any = np.uint8
             return
-        require(_is_shown_rule(space))
+        shown = is_box(space) and (len(space.shape) == 1 or (len(space.shape) in (2, 3, 4) and space.dtype == np.uint8))
+        if getattr(space, "is_np_flattenable", False):
+            fix = "add the wrapper gymnasium.wrappers:FlattenObservation, or one of your own"
+        else:
+            fix = "add a wrapper of your own, a gymnasium.ObservationWrapper that returns an array"
+        if is_box(space) and len(space.shape) in (2, 3) and (space.low >= 0).all() and (space.high > 1).any():
+            as_uint8 = "gymnasium.wrappers:DtypeObservation with {'dtype': 'uint8'}"
+            fix = f"for images add the wrapper {as_uint8}, for vectors gymnasium.wrappers:FlattenObservation"
+        require((shown, f"shows {_in_words(space)}, which cannot be stacked as images or vectors: {fix}"))
         shape = space.shape
         is_image = len(shape) > 2
         needless = (
@@ -239,18 +247,6 @@ def _as_array(value: Any) -> NDArray[Any]:
         return np.asarray(plain(value))
     except (TypeError, ValueError):
         return np.asarray(None)
-
-
-def _is_shown_rule(space: Any) -> tuple[bool, str]:
-    shown = is_box(space) and (len(space.shape) == 1 or (len(space.shape) in (2, 3, 4) and space.dtype == np.uint8))
-    if getattr(space, "is_np_flattenable", False):
-        fix = "add the wrapper gymnasium.wrappers:FlattenObservation, or one of your own"
-    else:
-        fix = "add a wrapper of your own, a gymnasium.ObservationWrapper that returns an array"
-    if is_box(space) and len(space.shape) in (2, 3) and (space.low >= 0).all() and (space.high > 1).any():
-        as_uint8 = "gymnasium.wrappers:DtypeObservation with {'dtype': 'uint8'}"
-        fix = f"for images add the wrapper {as_uint8}, for vectors gymnasium.wrappers:FlattenObservation"
-    return shown, f"shows {_in_words(space)}, which cannot be stacked as images or vectors: {fix}"
 
 
 def _place_of_channels(space: Any) -> str:
