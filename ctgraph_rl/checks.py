@@ -279,7 +279,7 @@ def is_shallow(value: object, levels: int) -> bool:
     if not isinstance(value, (dict, list)):
         return True
     items = value.values() if isinstance(value, dict) else value
-    return levels > 0 and all(is_shallow(item, levels - 1) for item in items)
+    return levels > 0 and all(is_shallow(item, levels - 1) for item in items if isinstance(item, (dict, list)))
 
 
 def at_least_one(**values: object) -> list[Rule]:

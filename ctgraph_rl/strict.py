@@ -14,6 +14,7 @@ import re
 import stat
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -61,14 +62,10 @@ def json_value(content: bytes, finite: bool = True, nesting: int = MAX_NESTING) 
         ValueError: for anything but JSON, repeated keys, too long integers, and too deep nesting.
     """
     text = content.decode("utf-8")
+    if text.startswith("\ufeff"):
+        raise ValueError("Unexpected UTF-8 BOM: save it without one")
     try:
-        value = json.loads(
-            text,
-            object_pairs_hook=_unique,
-            parse_int=_integer if LONG_NUMBER.search(text) else None,
-            parse_constant=_no_number if finite else None,
-            parse_float=_real if finite else None,
-        )
+        value = _decoder(finite, bool(LONG_NUMBER.search(text))).decode(text)
     except RecursionError:
         raise ValueError(f"nested more than {nesting} deep") from None
     require((is_shallow(value, nesting), f"nested more than {nesting} deep"))
@@ -105,10 +102,21 @@ def json_object(
     return str(path_or_dict), content
 
 
+@cache
+def _decoder(finite: bool, has_long: bool) -> json.JSONDecoder:
+    return json.JSONDecoder(
+        object_pairs_hook=_unique,
+        parse_int=_integer if has_long else None,
+        parse_constant=_no_number if finite else None,
+        parse_float=_real if finite else None,
+    )
+
+
 def _unique(pairs: list[tuple[str, Any]]) -> NamedValues:
-    twice = repeated(key for key, _ in pairs)
-    require((not twice, f"key {''.join(twice[:1])!r:.80} occurs twice in one object"))
-    return dict(pairs)
+    values = dict(pairs)
+    if len(values) < len(pairs):
+        raise ValueError(f"key {repeated(key for key, _ in pairs)[0]!r:.80} occurs twice in one object")
+    return values
 
 
 def _integer(digits: str) -> int:
