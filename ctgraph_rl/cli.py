@@ -198,3 +198,7 @@ def _unknown(word: str) -> str:
     near = groups.get(word) or meant.get(nearest(word, meant) or "")
     hint = "" if near is None else f"; did you mean ctgraph-rl {near}?"
     return f"unknown command {word!r}{hint}\nCommands: {', '.join(COMMANDS)}; settings of a run are written as seed=1"
+
+
+if __name__ == "__main__":
+    main()

@@ -29,10 +29,8 @@ from ctgraph_rl.tasks.similarity import shared_images, state_agreement
 from ctgraph_rl.tasks.task import Task, are_graphs, ct_graphs
 from ctgraph_rl.tasks.values import open_loop_ceiling, random_frames_to_goal
 
-AGENT, FRAMES_PER_SECOND = "lstm_ppo", 18_000
-"""An agent and its rough speed on one core, for estimates."""
-
-SECONDS_OF_AN_ID = 4e-8
+AGENT, FRAMES_PER_SECOND = "lstm_ppo", 41_000
+"""An agent and its speed on one idle core (docs/reference/agents.md), for estimates."""
 
 SECONDS_OF_A_MEAN = 2e-3
 """Time of an exact evaluation of a task of a stream, without memory."""
@@ -161,11 +159,8 @@ def _neighbours(stream: Stream) -> str:
 def _time(curriculum: Curriculum, frames_per_second: float | None) -> str:
     if frames_per_second is not None:
         return f"{_duration(curriculum.num_frames / frames_per_second)} at {frames_per_second:,.0f} frames/s"
-    protocol = curriculum.protocol
-    length = protocol.length(len(curriculum.tasks)) if protocol.task_id == "one_hot" else 0
-    rate = 1 / (1 / FRAMES_PER_SECOND + SECONDS_OF_AN_ID * length)
-    seconds = curriculum.num_frames / rate
-    return f"{_duration(seconds)} at {rate:,.0f} frames/s, the rate of agent={AGENT} on one core (--frames-per-second)"
+    seconds = _duration(curriculum.num_frames / FRAMES_PER_SECOND)
+    return f"{seconds} at {FRAMES_PER_SECOND:,} frames/s, the rate of agent={AGENT} on one core (--frames-per-second)"
 
 
 def _evaluation_seconds(curriculum: Curriculum) -> float:

@@ -340,14 +340,3 @@ def test_a_figure_without_matplotlib_names_the_extra(tmp_path, monkeypatch):
 
     with pytest.raises(ModuleNotFoundError, match=r"figures need matplotlib: pip install 'ctgraph_rl\[plot\]'"):
         draw_graphs(make(), tmp_path / "graphs.png")
-
-
-@pytest.mark.parametrize(
-    ("protocol", "rate"),
-    [(Protocol(), "18,000"), (Protocol(task_id="one_hot", num_task_ids=16_368), "1,408")],
-    ids=["none", "long"],
-)
-def test_the_estimated_rate_counts_the_numbers_of_task_ids(protocol, rate):
-    overview = dict(describe(replace(make(), protocol=protocol))[0].rows)
-
-    assert f" at {rate} frames/s, the rate of agent=lstm_ppo on one core" in overview["time"]

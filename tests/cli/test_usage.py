@@ -83,6 +83,12 @@ def test_the_command_run_and_settings_alone_start_a_run(call, runs, words, setti
     assert runs == [settings]
 
 
+def test_the_module_is_the_command():
+    result = subprocess.run([sys.executable, "-m", "ctgraph_rl.cli", "--version"], capture_output=True, text=True)
+
+    assert result.stdout == f"{cli.versions()}\n"
+
+
 def test_the_version_is_its_own_with_those_of_what_it_is_built_on(call):
     code, out, err = call("--version")
 

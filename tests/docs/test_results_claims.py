@@ -51,7 +51,7 @@ def test_readme_says_how_many_seeds_solve_depth_5(make):
     assert (solved, deepest) == ({"ppo": [0.0] * 5, "ppo_count": [1.0] * 5}, ("single_task", "102400"))
     assert (
         "PPO solves depth 5 in 0 of 5 seeds with 102,400 frames. "
-        "With a bonus for rare observations it solves it in 5 of 5." in README
+        "With `ppo_count`, a bonus for rare observations, it solves it in 5 of 5." in README
     )
     assert (
         "combines masks of earlier tasks, solves all eight tasks in 20 of 20 seeds. Fine-tuned PPO solves both tasks "

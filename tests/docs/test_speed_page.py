@@ -177,9 +177,6 @@ def test_what_the_page_says_of_gpus_in_words_was_measured(gpu):
         f"1,024 seeds of the main job would take {minutes:.1f} minutes",
     ):
         assert sentence in " ".join(page.split())
-    published = learned["ppo_published, 1,024 seeds as one job", 4_096]
-    study = f"One H100 would take {14_336e6 / published / 3600:.0f} hours without evaluations"
-    assert study in " ".join((CHECKOUT / "docs" / "how-to" / "large_sweeps.md").read_text(encoding="utf-8").split())
     readme = " ".join((CHECKOUT / "README.md").read_text(encoding="utf-8").split())
     ppo = learned["ppo, captured", 65_536] / 1e6
     said = f"One H100, 65,536 environments: fused steps take {su:.1f} billion a second"

@@ -11,11 +11,16 @@ from pathlib import Path
 import pytest
 from helpers.paths import CHECKOUT
 from helpers.sweeping import command_line
+from torch import nn
 
+import curricula
+from baselines.methods.mas import MAS
 from ctgraph_rl import CTGraph, CTGraphEnv, Observations, PaperImages, Task
+from ctgraph_rl.checks import require
 from ctgraph_rl.core import kernel
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.draw import style
+from ctgraph_rl.learn.exact import exact_rules
 from ctgraph_rl.report import intervals
 from ctgraph_rl.tasks.configurations import ct_fo_b1, ct_su_b1
 
@@ -48,6 +53,8 @@ RAISED: list[Callable[[], object]] = [
     lambda: kernel._key(Path(kernel.__file__), ["no-compiler"]),
     lambda: intervals.scipy("stats"),
     lambda: style.new_figure(1, 1),
+    lambda: MAS(8, coeff=1.0, heads="auto").attach(nn.Linear(1, 1), curricula.load("fo_b1_4tasks")),
+    lambda: require(*exact_rules(nn.Linear(1, 1), ct_su_b1(), {})),
 ]
 
 TYPED = (
@@ -57,6 +64,7 @@ TYPED = (
     "agent.lr=1",
     "-m method=finetune,ewc method.coeff=1,2",
     "hydra/launcher=joblib",
+    "method=mask_ri",
 )
 """Settings of runs that are refused."""
 
@@ -77,7 +85,7 @@ def test_every_message_that_the_page_quotes_is_raised(monkeypatch, capsys, tmp_p
         with pytest.raises((ValueError, ModuleNotFoundError)) as refusal:
             raised()
         messages.append(str(refusal.value))
-    assert len(QUOTED) >= 17
+    assert len(QUOTED) >= 20
     assert len(messages) == len(TYPED) + len(RAISED)
     assert [
         quoted

@@ -185,9 +185,14 @@ def large_sets() -> list[Row]:
     of = {number: runs("co_hard", num_wait_images=number, cell="lstm") for number in ("1", "10", "500", "5000")}
     sizes = "; ".join(f"{number}: {frames_in_words(lines, FIRST)}" for number, lines in of.items())
     words, effect = compare_times(of["5000"], of["1"], FIRST)
-    test = "5,000 wait images against one: frames to a return of 0.9, LSTM-PPO"
+    test = "5,000 wait images against one: frames to a return of 0.9, LSTM-PPO; seeds added after a look"
     first = Row("sets", test, f"{words}; median by images {sizes}", effect)
-    return [first, Row("sets", "500 wait images against 100, six agents with memory, four graphs", *older_sets())]
+    return [
+        first,
+        Row(
+            "sets", "500 wait images against 100, six agents with memory, which share seeds, four graphs", *older_sets()
+        ),
+    ]
 
 
 def older_sets() -> tuple[str, Effect]:
@@ -261,7 +266,14 @@ def negative_samples() -> list[Row]:
     number = f"episodes at an end by standard deviation {rates}; control {control:.2f}"
     lost = differences(of["0"], of[STDS[-1]], "end_rate")
     effect = Effect(lost, OF_SUCCESS, mean(of["0"], "end_rate") - control)
-    return [Row("negative", f"noise of standard deviation {STDS[-1]} against none, PPO, CT-FO-B1", number, effect)]
+    return [
+        Row(
+            "negative",
+            f"noise of standard deviation {STDS[-1]} against none, PPO, CT-FO-B1; added after 10 failed",
+            number,
+            effect,
+        )
+    ]
 
 
 def advantages() -> list[Row]:
@@ -346,7 +358,7 @@ def waiting() -> list[Row]:
     rows = []
     for method in ("finetune", "clear", "mask_lc"):
         words, effect = compare_times(scratch, runs("shared_waiting", method=method), LATER)
-        test = f"frames of later tasks: `scratch` against `{method}`, LSTM-PPO"
+        test = f"frames of later tasks: `scratch` against `{method}`, only LSTM-PPO"
         rows.append(Row("waiting", test, f"`scratch` is {words}", effect))
     return rows
 

@@ -81,7 +81,9 @@ def test_what_is_said_of_abrupt_changes_holds():
     assert [goals(line) for line in oracle] == [4, 4, 4] and "a return of 1 on all four goals in each seed" in SECTION
     assert sorted(map(goals, adwin)) == [2, 3, 3] and "three goals in two seeds and with two in the third" in SECTION
     assert "end with two or three goals of four. With the oracle's labels they end with all" in " ".join(PAGE.split())
-    assert "With 102,400 frames and ADWIN it keeps two or three of four goals (3 seeds; [no labels]" in README
+    assert (
+        "With 102,400 frames and ADWIN it keeps two or three of four goals on `task_free_abrupt`, three on " in README
+    )
     assert [line["final_returns"] for line in none] == ["0 0 0 1"] * 3
     assert "Fine-tuning ends with the last goal in each seed" in SECTION
     assert {float(line["labels_per_task"]) for line in adwin} == {0.75} and "three labels for four goals" in SECTION
