@@ -9,7 +9,7 @@ import pytest
 import curricula
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(8))
 def test_the_goals_of_goal_conflict_disagree_at_every_decision_on_the_same_images(seed):
     first, second = curricula.load("goal_conflict").for_seed(seed).tasks
 
@@ -18,9 +18,10 @@ def test_the_goals_of_goal_conflict_disagree_at_every_decision_on_the_same_image
 
 
 def test_seeds_draw_different_images_and_all_goals():
-    drawn = [curricula.load("goal_conflict").for_seed(seed).tasks[0] for seed in range(200)]
+    life = curricula.load("goal_conflict")
+    drawn = [life.for_seed(seed).tasks[0] for seed in range(40)]
 
-    assert len({task.images for task in drawn}) == 200
+    assert len({task.images for task in drawn}) == 40
     assert len({task.goal for task in drawn}) == 8
 
 

@@ -10,7 +10,7 @@ from scipy.stats import rankdata
 
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.statistics import LEAST_FOR_BOOTSTRAP, Comparison
-from studies.raw import Raw, fill, groups, read, select, shown, table
+from studies.raw import Raw, fill, groups, read, shown, table
 from studies.verdicts import UNKNOWN
 
 NAME = "plasticity"
@@ -58,8 +58,10 @@ RESAMPLES = 4000
 def later_blocks(curriculum: str, condition: str, blocks: range | None = None) -> dict[str, Raw]:
     """Return the lines of blocks, those of `COMPARED` unless given, by seed."""
     wanted = COMPARED[curriculum] if blocks is None else blocks
-    lines = select(read(NAME), curriculum=curriculum, condition=condition)
-    lines = [line for line in lines if int(line["block"]) in wanted]
+    lines = []
+    for line in read(NAME):
+        if line["condition"] == condition and line["curriculum"] == curriculum and int(line["block"]) in wanted:
+            lines.append(line)
     return {seed: of_seed for (seed,), of_seed in groups(lines, "seed").items()}
 
 
@@ -79,8 +81,8 @@ def compared(curriculum: str, first: str, second: str, blocks: range | None = No
 
 def nine_against(curriculum: str, other: str) -> dict[str, Comparison]:
     """Compare the nine methods with another condition, with p-values by Holm over the nine."""
-    ran = [name for name in NINE if later_blocks(curriculum, name)]
-    return statistics.corrected({name: compared(curriculum, name, other) for name in ran})
+    ran = {line["condition"] for line in read(NAME) if line["curriculum"] == curriculum}
+    return statistics.corrected({name: compared(curriculum, name, other) for name in NINE if name in ran})
 
 
 def conditions_table() -> str:
@@ -109,9 +111,10 @@ def better(curriculum: str, other: str = "none") -> str:
     seeds = len(later_blocks(curriculum, other))
     if len(NINE) * 2 ** (1 - seeds) > ALPHA:
         return f"{UNKNOWN}: {seeds} seeds"
+    found = nine_against(curriculum, other)
     for word, sign in (("better", 1), ("worse", -1)):
         names = []
-        for name, each in nine_against(curriculum, other).items():
+        for name, each in found.items():
             if each.holm is not None and each.holm <= ALPHA and (each.difference.value or 0) * sign > 0:
                 names.append(NINE[name])
         parts.append(f"{word}: {', '.join(names) or 'none'}")
