@@ -5,6 +5,7 @@ It multiplies for all histories at once where PyTorch's does each step's operati
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import torch
@@ -29,7 +30,9 @@ class Gates(Protocol):
     """Whether a step reads only the sum of its two products, so that they have one gradient."""
 
     @staticmethod
-    def step(given: Tensor, carried: Tensor, before: CellState, after: CellState, kept: CellState) -> None:
+    def step(
+        given: Tensor, carried: Tensor, before: Sequence[Tensor], after: Sequence[Tensor], kept: Sequence[Tensor]
+    ) -> None:
         """Write the next state, and what `factors` needs.
 
         Args:
@@ -42,12 +45,12 @@ class Gates(Protocol):
         ...
 
     @staticmethod
-    def factors(carried: Tensor, kept: CellState, before: CellState) -> CellState:
+    def factors(carried: Tensor, kept: Sequence[Tensor], before: Sequence[Tensor]) -> CellState:
         """Return what gradients of any number of steps are multiplied by."""
         ...
 
     @staticmethod
-    def back(factors: CellState, by: CellState, by_given: Tensor, by_carried: Tensor) -> CellState:
+    def back(factors: Sequence[Tensor], by: Sequence[Tensor], by_given: Tensor, by_carried: Tensor) -> CellState:
         """Write gradients by ``given`` and ``carried``; return those by the state, without that through ``carried``.
 
         Args:
@@ -64,7 +67,9 @@ class LSTMGates(Gates):
 
     @override
     @staticmethod
-    def step(given: Tensor, carried: Tensor, before: CellState, after: CellState, kept: CellState) -> None:
+    def step(
+        given: Tensor, carried: Tensor, before: Sequence[Tensor], after: Sequence[Tensor], kept: Sequence[Tensor]
+    ) -> None:
         g, squashed = kept
         h, c = after
         carried.add_(given)
@@ -76,7 +81,7 @@ class LSTMGates(Gates):
 
     @override
     @staticmethod
-    def factors(carried: Tensor, kept: CellState, before: CellState) -> CellState:
+    def factors(carried: Tensor, kept: Sequence[Tensor], before: Sequence[Tensor]) -> CellState:
         g, squashed = kept
         i, f, _, o = carried.chunk(4, dim=1)
         of_gates = (1 - carried).mul_(carried)
@@ -89,7 +94,7 @@ class LSTMGates(Gates):
 
     @override
     @staticmethod
-    def back(factors: CellState, by: CellState, by_given: Tensor, by_carried: Tensor) -> CellState:
+    def back(factors: Sequence[Tensor], by: Sequence[Tensor], by_given: Tensor, by_carried: Tensor) -> CellState:
         of_gates, of_h, f = factors
         by_h, by_c = by
         by_c = torch.addcmul(by_c, by_h, of_h)
@@ -105,7 +110,9 @@ class GRUGates(Gates):
 
     @override
     @staticmethod
-    def step(given: Tensor, carried: Tensor, before: CellState, after: CellState, kept: CellState) -> None:
+    def step(
+        given: Tensor, carried: Tensor, before: Sequence[Tensor], after: Sequence[Tensor], kept: Sequence[Tensor]
+    ) -> None:
         [n] = kept
         size = n.shape[1]
         r, z = carried[:, : 2 * size].add_(given[:, : 2 * size]).sigmoid_().chunk(2, dim=1)
@@ -114,7 +121,7 @@ class GRUGates(Gates):
 
     @override
     @staticmethod
-    def factors(carried: Tensor, kept: CellState, before: CellState) -> CellState:
+    def factors(carried: Tensor, kept: Sequence[Tensor], before: Sequence[Tensor]) -> CellState:
         [n] = kept
         r, z, of_h = carried.chunk(3, dim=1)
         of_n = (1 - z) * (1 - n.square())
@@ -124,7 +131,7 @@ class GRUGates(Gates):
 
     @override
     @staticmethod
-    def back(factors: CellState, by: CellState, by_given: Tensor, by_carried: Tensor) -> CellState:
+    def back(factors: Sequence[Tensor], by: Sequence[Tensor], by_given: Tensor, by_carried: Tensor) -> CellState:
         of_given, of_carried, z = factors
         by_gates = torch.cat([by[0], by[0], by[0]], dim=1)
         torch.mul(by_gates, of_given, out=by_given)
