@@ -58,7 +58,7 @@ class Plasticity(TakesNumbers, PlasticityHooks):
         )
         assert isinstance(agent, Learner)
         drawn = f"{name} acts where a task starts, and {kind.__name__} draws its tasks: take plasticity=none"
-        require((not (self.needs_boundaries and getattr(agent, "adapt_episodes", 0)), drawn))
+        require((not (self.needs_boundaries and getattr(agent, "adapt_episodes", None)), drawn))
         self.layers = [layer for layer in hidden_layers(agent.policy) if layer.linear is not None]
         units = f"{name} acts on hidden units, and {kind.__name__} has none that it tells: take agent=ppo or lstm_ppo"
         require((bool(self.layers) or not self.reads_units, units))
