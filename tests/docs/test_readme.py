@@ -106,7 +106,7 @@ def test_a_file_of_results_is_what_a_commit_beside_it_stored():
     lines = [line for line in page.splitlines() if re.match(r"\|.*\]\([\w./]+\.(csv|json)\)", line)]
     with_commits = [line for line in lines if re.search(r"\b[0-9a-f]{8}\b", line)]
 
-    assert len(with_commits) > 25 and len(lines) - len(with_commits) == 2  # streams and plasticity
+    assert len(with_commits) > 25 and len(lines) == len(with_commits)
     for line in with_commits:
         commits = re.findall(r"\b[0-9a-f]{8}\b", line)
         for file in re.findall(r"\]\(([\w./]+\.(?:csv|json))\)", line):

@@ -171,5 +171,5 @@ def test_raw_results_say_the_machine_of_each_run_and_where_it_is_not_recorded(ma
     (tmp_path / "table.csv").write_text("\n".join(lines), encoding="utf-8")
 
     assert raw.machines("table") == (
-        "1 of 3 rows: not recorded; 1 of 3 rows: x86_64 AVX2, not recorded; 1 of 3 rows: x86_64 AVX512, AMD EPYC"
+        "1 rows: not recorded; 1 rows: x86_64 AVX2, not recorded; 1 rows: x86_64 AVX512, AMD EPYC"
     )

@@ -44,7 +44,7 @@ def machines(*names: str) -> str:
     """A sentence about the machines that the rows of tables are of."""
     rows = [line for name in names for line in read(name)]
     counts = Counter(", ".join(dict.fromkeys(line.get(key) or NOT_RECORDED for key in MACHINE)) for line in rows)
-    return "; ".join(f"{count:,} of {len(rows):,} rows: {what}" for what, count in sorted(counts.items()))
+    return "; ".join(f"{count:,} rows: {what}" for what, count in sorted(counts.items()))
 
 
 def fill(name: str, texts: Mapping[str, object]) -> str:

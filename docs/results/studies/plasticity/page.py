@@ -115,14 +115,15 @@ def better(curriculum: str, other: str = "none") -> str:
     for word, sign in (("better", 1), ("worse", -1)):
         names = []
         for name, each in found.items():
-            if each.holm is not None and each.holm <= ALPHA and (each.difference.value or 0) * sign > 0:
-                names.append(NINE[name])
+            value = each.difference.value or 0
+            if each.holm is not None and each.holm <= ALPHA and value * sign > 0:
+                names.append(f"{NINE[name]} {value:+.2f}")
         parts.append(f"{word}: {', '.join(names) or 'none'}")
     return "; ".join(parts)
 
 
 def matched_words() -> str:
-    """Return what the start costs, and what the old weights cost, with the seeds that were not distilled."""
+    """Return what the start costs, and what the old weights cost, with the seeds that were distilled."""
     lines = read(MATCHED)
     of = _areas(lines)
     compared_costs = {
@@ -133,8 +134,8 @@ def matched_words() -> str:
     for name, each in compared_costs.items():
         decided = each.p_value is not None and each.p_value <= ALPHA
         costs.append(f"{name} {shown(each.difference)}{'' if decided else f' ({UNKNOWN})'}")
-    misses = len({line["seed"] for line in lines}) - len(of["distilled"])
-    return f"{', '.join(costs)}; seeds that were not distilled: {misses}"
+    seeds = len({line["seed"] for line in lines})
+    return f"{', '.join(costs)}; distilling worked in {len(of['distilled'])} of {seeds} seeds"
 
 
 def _areas(lines: Raw) -> dict[str, list[float]]:
@@ -223,9 +224,9 @@ def page() -> str:
         "conflict_seeds": len(later_blocks(CONFLICT, "none")),
         "stream_seeds": len(later_blocks(STREAM, "none")),
         "late_seeds": len(later_blocks(STREAM, "none", LATE)),
-        "loss_late": shown(compared(STREAM, "none", "fresh", LATE).difference),
-        "loss_conflict": shown(compared(CONFLICT, "none", "fresh").difference),
-        "loss_stream": shown(compared(STREAM, "none", "fresh").difference),
+        "loss_late": shown(compared(STREAM, "fresh", "none", LATE).difference),
+        "loss_conflict": shown(compared(CONFLICT, "fresh", "none").difference),
+        "loss_stream": shown(compared(STREAM, "fresh", "none").difference),
         "matched": matched_words(),
         "forecast_conflict": forecast_words(CONFLICT),
         "forecast_stream": forecast_words(STREAM),
