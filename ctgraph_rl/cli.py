@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import gc
 import os
 import sys
@@ -146,6 +147,8 @@ def first_imports() -> Iterator[None]:
     finally:
         if pauses:
             gc.freeze()
+            if "triton" in sys.modules:  # it lists what is left at the exit
+                atexit.register(gc.unfreeze)
             young, middle, _ = gc.get_threshold()
             gc.set_threshold(young, middle, FULL_COLLECTIONS)
             gc.enable()
