@@ -24,14 +24,14 @@ NOT_MODIFIED: Modified = {}
 WIDTH = 80
 
 MEANS = "mean [95 % CI]"
-CI = "95 of 100 such intervals (CI) hold the true value"
-_EXACT = f"those of solved seeds and median times are exact; {CI}"
-LEGEND = f"{MEANS}; {_EXACT}"
+CI = "about 95 or more of 100 such intervals (CI) hold the true mean"
+_EXACT = "intervals of solved seeds and of median times are exact"
+LEGEND = f"{MEANS}; {CI}; {_EXACT}"
 
 LEGENDS = {
     "exact": LEGEND,
     "t": f"mean [Student's 95 % CI]; {_EXACT}",
-    "std": f"mean ± standard deviation over seeds; solved seeds and median times have exact intervals; {CI}",
+    "std": f"mean ± standard deviation over seeds; {_EXACT}",
     "iqm": f"interquartile mean [bootstrap 95 % CI]; {_EXACT}",
     "seeds": "single runs",
 }

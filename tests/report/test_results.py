@@ -263,8 +263,9 @@ def test_the_table_is_printed_and_written(tmp_path, monkeypatch, capsys):
 
     shown = capsys.readouterr().out
     assert "    average performance   0.81 [0.02, 1.61]    n = 2\n" in shown
-    assert "mean [95 % CI]; those of solved seeds and median times are exact; 95 of 100 such intervals" in " ".join(
-        shown.split()
+    assert (
+        "mean [95 % CI]; about 95 or more of 100 such intervals (CI) hold the true mean; intervals of solved"
+        in " ".join(shown.split())
     )
     test = "sign-flip p = 0.5, Holm 0.5: not distinguishable with 2 seeds"
     seen = "6 would find such a difference with a chance of 80 %"
@@ -296,7 +297,7 @@ def test_a_table_has_the_statistics_that_are_asked_for(tmp_path, monkeypatch, ca
     assert "solved rate 0.62 [0.24, 0.90] n = 4" in shown["exact"]
     assert "solved rate 0.62 [0.23, 1.02] n = 4" in shown["t"]
     assert "$\\pm$ 0.25" in shown_by(monkeypatch, capsys, str(tmp_path), "--statistics", "std", "--format", "latex")
-    assert shown["std"].startswith("mean ± standard deviation over seeds; solved seeds")
+    assert shown["std"].startswith("mean ± standard deviation over seeds; intervals of solved seeds")
     assert "average performance 0.72 ± 0.21 n = 4" in shown["std"]
     assert "average performance 0.69 [" in shown["iqm"]
     assert "interquartile return 0.88 [" in shown["iqm"]  # 0, 0.25, 0.5 and five times 1

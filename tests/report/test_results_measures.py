@@ -93,8 +93,8 @@ def test_tables_for_papers_have_a_line_for_each_measure(tmp_path):
         *("", "1. all seeds are equal: no spread to estimate"),
     ]
     assert [line for line in paper if line.startswith(("PPO", " & ", r"\caption"))] == [
-        r"\caption{a\_b: mean {[}95 \% CI]; those of solved seeds and median times are exact; "
-        r"95 of 100 such intervals (CI) hold the true value; "
+        r"\caption{a\_b: mean {[}95 \% CI]; about 95 or more of 100 such intervals (CI) hold the true mean; "
+        r"intervals of solved seeds and of median times are exact; "
         r"n: seeds with a value / seeds expected.}",
         r"PPO & 2 & 0.00\rlap{\textsuperscript{a}} & $-$0.75 \\",
         r" &  &  & {\scriptsize [$-$3.93, 2.43]} \\",
