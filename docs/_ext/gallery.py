@@ -46,7 +46,7 @@ TITLES = {
     "surjective": "Surjective: an image for each kind of state",
     "visits": "Where a random policy goes",
 }
-"""What the figures of the page on drawing show."""
+"""What the figures of the pages on pictures and drawing show."""
 
 MAKE, REPORT = "python docs/results/make.py", "ctgraph-rl report runs/su_b1_4tasks --agent LSTMPPO=LSTM-PPO"
 RESULTS = {
@@ -62,7 +62,8 @@ RESULTS = {
 
 def gallery_page(folder: Path) -> str:
     """Draw the figures of commands into a folder, and return the page of all tiles in Markdown."""
-    tiles = [*_drawn(folder), *_of_page("how-to/draw_and_play.md"), *_of_results()]
+    of_pages = [*_of_page("explanation/ct_graph_in_pictures.md"), *_of_page("how-to/draw_and_play.md")]
+    tiles = [*_drawn(folder), *dict.fromkeys(of_pages), *_of_results()]
     parts = ["# Gallery", "Every figure with the command that makes it.", "::::{container} gallery"]
     return "\n\n".join([*parts, *map(_markdown, tiles), "::::"]) + "\n"
 
