@@ -30,7 +30,7 @@ class JAX:
         self.memory = name == "lstm_ppo"
         self.length = 2 * task.graph.depth + 2
         self.count = task.graph.branching_factor + 1
-        actions = torch.tensor(list(product(range(self.count), repeat=self.length)))
+        actions = torch.tensor(list(product(range(self.count), repeat=self.length)), dtype=torch.int64, device="cpu")
         env = CTGraphEnv([task] * len(actions), 0)
         data = env.reset()
         shown = [data["observation"].flatten(1)]

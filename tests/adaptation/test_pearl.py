@@ -182,7 +182,7 @@ def test_replay_keeps_the_last_steps_of_all_rows():
 
     batches = [numbered(agent, seed=seed) for seed in range(2)]
     for batch in batches:
-        agent._store(batch)
+        next(agent.minibatches(batch))
 
     both = torch.cat([batch["next", "reward"] for batch in batches], dim=1)
     assert torch.equal(agent.replay["next", "reward"], both[:, -30:])
