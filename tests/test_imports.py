@@ -72,7 +72,8 @@ for package in ("ctgraph_rl", "baselines", "curricula", "benchmarks", "hydra_plu
     path = importlib.util.find_spec(package).submodule_search_locations
     names += [module.name for module in pkgutil.walk_packages(path, f"{package}.")]
 for name in names:
-    if name.endswith("__main__"):
+    needs_jax = name == "benchmarks.jax_ppo"
+    if name.endswith("__main__") or (needs_jax and importlib.util.find_spec("jax") is None):
         continue
     known = set(gymnasium.registry)
     importlib.import_module(name)

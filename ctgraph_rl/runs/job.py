@@ -102,7 +102,8 @@ def build(
     usual = bool(cfg.get("plasticity")) and all(holds for holds, _ in unit_rules(curriculum, member.agent, True))
     check_share(curriculum, member.agent, cfg.objective_until)
     member.log_units = usual if cfg.log_units is None else cfg.log_units
-    require(*unit_rules(curriculum, member.agent, member.log_units))
+    if member.log_units is not False:
+        require(*unit_rules(curriculum, member.agent, member.log_units))
     return member
 
 

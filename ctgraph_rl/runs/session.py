@@ -240,7 +240,8 @@ class OneBatch(SessionCoupling):
         agent = members[0].agent
         check_rows(curriculum, agent.num_envs)
         check_ids(curriculum, agent)
-        require(*unit_rules(curriculum, agent, members[0].log_units))
+        if members[0].log_units is not False:
+            require(*unit_rules(curriculum, agent, members[0].log_units))
         for each in members:
             each.checkpoints.tidy()
         begun = [each for each in members if each.checkpoints.files()]

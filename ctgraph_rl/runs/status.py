@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Hashable, Mapping
 from contextlib import suppress
 from datetime import timedelta
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -136,7 +137,7 @@ def report(statuses: Mapping[str, Status], repeated: int = 0, most: int | None =
     """Report the number of cells by state, and why some are not done.
 
     Args:
-        most: named cells; None: all.
+        most: lines of cells, one for all that failed alike; None: a line a cell.
     """
     counts = Counter(found.state for found in statuses.values())
     states = (DONE, *([STALE] if counts[STALE] else []), FAILED, IN_USE, MISSING)
@@ -144,9 +145,17 @@ def report(statuses: Mapping[str, Status], repeated: int = 0, most: int | None =
     twice = f" ({repeated} more are the same as others)" if repeated else ""
     lines = [f"sweep of {len(statuses)} cells{twice}: {numbers}"]
     left = [(name, found) for name, found in statuses.items() if found.state != DONE]
-    lines += [f"  {state:<7}  {name}  {terminal_text(reason)}" for name, (state, reason) in left[:most]]
-    if most is not None and len(left) > most:
-        lines.append(f"  and {len(left) - most} more")
+    alike: dict[tuple[Status, str], list[str]] = {}
+    for name, found in left:
+        is_listed = most is None or found.state != FAILED
+        alike.setdefault((found, name if is_listed else ""), []).append(name)
+    unnamed = len(left)
+    for (found, _), names in islice(alike.items(), most):
+        others = f" and {len(names) - 1} more" if len(names) > 1 else ""
+        lines.append(f"  {found.state:<7}  {names[0]}{others}  {terminal_text(found.reason)}")
+        unnamed -= len(names)
+    if unnamed:
+        lines.append(f"  and {unnamed} more")
     if counts[STALE]:
         lines.append(f"stale: the code has changed since; {START_AGAIN}")
     elif left:

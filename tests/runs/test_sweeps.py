@@ -137,15 +137,13 @@ def test_status_runs_nothing_and_knows_why_cells_failed(learned, monkeypatch, ca
     ]
 
 
-def test_status_names_every_cell_and_the_end_of_a_sweep_the_first(learned, monkeypatch, capsys):
-    monkeypatch.setattr("ctgraph_rl.runs.sweep.SHOWN", 2)
-
+def test_status_names_every_cell_and_the_end_of_a_sweep_each_failure_once(learned, monkeypatch, capsys):
     cells = (f"seed={UNLUCKY}", "agent.gamma=0.1,0.2,0.3,0.4")
     said = [sweep(monkeypatch, *cells, f"hydra.sweeper.status={status}") for status in ("true", "false")]
 
     lines = capsys.readouterr().out.splitlines()
     assert said == [1, 1]
-    assert [sum(line.startswith(f"  {state}") for line in lines) for state in ("missing", "failed")] == [4, 2]
+    assert [sum(line.startswith(f"  {state}") for line in lines) for state in ("missing", "failed")] == [4, 1]
 
 
 def test_a_cell_that_another_process_runs_is_left_to_it(learned, monkeypatch, capsys):
@@ -326,7 +324,7 @@ def test_a_sweep_on_processes_runs_every_cell_and_shows_no_bars(checkout, tmp_pa
     assert (result.returncode, result.stderr) == (1, "")
     assert result.stdout.splitlines()[:2] == [
         "sweep of 4 cells: 2 done, 2 failed, 0 in use, 0 missing",
-        "  failed   seed=0 agent.gamma=2  ValueError: agent.gamma must be in [0, 1], got 2",
+        "  failed   seed=0 agent.gamma=2 and 1 more  ValueError: agent.gamma must be in [0, 1], got 2",
     ]
     assert len(list(tmp_path.glob("runs/*/*/agent.pt"))) == 2
 
@@ -423,6 +421,13 @@ def test_a_report_names_the_first_cells_that_are_not_done():
     assert lines[0] == f"sweep of {SHOWN + 6} cells: 1 done, 0 failed, 0 in use, {SHOWN + 5} missing"
     assert lines[1] == "  missing  seed=0  not begun"
     assert lines[SHOWN + 1] == "  and 5 more" and len(lines) == SHOWN + 3
+
+
+def test_cells_that_failed_alike_have_one_line_but_in_a_list_of_all():
+    cells = {f"seed={seed}": Status("failed", "too much" if seed < 30 else "NaN") for seed in range(31)}
+
+    assert report(cells).splitlines()[1:-1] == ["  failed   seed=0 and 29 more  too much", "  failed   seed=30  NaN"]
+    assert len(report(cells, most=None).splitlines()) == 1 + len(cells) + 1
 
 
 def test_cells_are_named_by_what_differs():
