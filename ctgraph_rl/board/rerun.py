@@ -1,7 +1,7 @@
 """Level *rerun* of a verification: drawn runs are trained again in separate processes and compared bit by bit.
 
 The drawn runs are those with the smallest SHA-256 of ``DIGEST NUMBER RUN``, so that neither side can choose them. Seeds
-that were trained as one group are trained again as that group.
+that were trained as one group are trained again as one group.
 """
 
 from __future__ import annotations
