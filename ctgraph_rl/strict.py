@@ -65,10 +65,11 @@ def json_value(content: bytes, finite: bool = True, nesting: int = MAX_NESTING) 
     if text.startswith("\ufeff"):
         raise ValueError("Unexpected UTF-8 BOM: save it without one")
     try:
-        value = _decoder(finite, bool(LONG_NUMBER.search(text))).decode(text)
+        value = _decoder(finite).decode(text)
     except RecursionError:
         raise ValueError(f"nested more than {nesting} deep") from None
-    require((is_shallow(value, nesting), f"nested more than {nesting} deep"))
+    if text.count("{") + text.count("[") > nesting and not is_shallow(value, nesting):
+        raise ValueError(f"nested more than {nesting} deep")
     return value
 
 
@@ -103,10 +104,10 @@ def json_object(
 
 
 @cache
-def _decoder(finite: bool, has_long: bool) -> json.JSONDecoder:
+def _decoder(finite: bool) -> json.JSONDecoder:
     return json.JSONDecoder(
         object_pairs_hook=_unique,
-        parse_int=_integer if has_long else None,
+        parse_int=_integer,
         parse_constant=_no_number if finite else None,
         parse_float=_real if finite else None,
     )
@@ -120,9 +121,8 @@ def _unique(pairs: list[tuple[str, Any]]) -> NamedValues:
 
 
 def _integer(digits: str) -> int:
-    require(
-        (len(digits) <= LONGEST_NUMBER + 1, f"an integer has {len(digits):,} digits, the limit is {LONGEST_NUMBER}")
-    )
+    if len(digits) > LONGEST_NUMBER + 1:
+        raise ValueError(f"an integer has {len(digits):,} digits, the limit is {LONGEST_NUMBER}")
     return int(digits)
 
 

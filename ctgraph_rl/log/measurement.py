@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -13,7 +13,6 @@ from ctgraph_rl.checks import (
     ReadOnlyValues,
     is_int,
     is_real,
-    require,
 )
 from ctgraph_rl.strict import json_value
 
@@ -26,6 +25,8 @@ LARGEST = 1e100
 
 
 def _is_number(value: object) -> bool:
+    if type(value) is float:  # most are
+        return -LARGEST <= value <= LARGEST
     return value is None or is_real(value, -LARGEST, LARGEST)
 
 
@@ -115,10 +116,9 @@ def check(measurement: ReadOnlyValues, most: int = MOST) -> None:
     """
     broken = []
     for name, value in measurement.items():
-        if name in RULES:
-            holds, what = RULES[name]
-            if not holds(value):
-                broken.append(f"{name} must be {what}, got {value!r:.80}")
+        rule = RULES.get(name)
+        if rule is not None and not rule[0](value):
+            broken.append(f"{name} must be {rule[1]}, got {value!r:.80}")
         if isinstance(value, int) and not -LARGEST_INT <= value <= LARGEST_INT:
             broken.append(f"{name} must be an integer of 64 bits")
     kind = measurement["kind"]
@@ -126,10 +126,14 @@ def check(measurement: ReadOnlyValues, most: int = MOST) -> None:
     missing = [name for name in needed if name not in measurement]
     if missing:
         broken.append(f"{', '.join(missing)} must be there")
-    require((not broken, "; ".join(broken)))
-    highest = max(_numbers(measurement), default=0)
-    rule = f"block or task {highest:,} is beyond what a file of its size can measure, {most:,}"
-    require((highest <= most, rule))
+    if not broken:
+        highest = max(measurement.get("block", 0), measurement.get("task", 0), measurement.get("step", 0))
+        for block in measurement.get("trained", ()):
+            highest = max(highest, *block)
+        if highest > most:
+            broken.append(f"block or task {highest:,} is beyond what a file of its size can measure, {most:,}")
+    if broken:
+        raise ValueError("; ".join(broken))
 
 
 def without_time(measurement: ReadOnlyValues) -> NamedValues:
@@ -142,9 +146,3 @@ def without_time(measurement: ReadOnlyValues) -> NamedValues:
 
 def _without_place(expert: Any) -> Any:
     return {key: value for key, value in expert.items() if key != "run"} if isinstance(expert, dict) else expert
-
-
-def _numbers(measurement: ReadOnlyValues) -> Iterator[int]:
-    yield from (measurement[name] for name in ("block", "task", "step") if name in measurement)
-    for block in measurement.get("trained", ()):
-        yield from block

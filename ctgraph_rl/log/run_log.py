@@ -191,31 +191,28 @@ class RunLog:
         *lines, last = content.split(b"\n")
         log = cls()
         log._num_bytes = len(content)
-        for number, line in enumerate(lines, 1):
-            try:
-                log.measurements.append(parsed(line))
-            except ValueError as error:
-                why = f"{error.msg} at character {error.pos + 1}" if isinstance(error, json.JSONDecodeError) else error
-                raise ValueError(f"{path}: line {number} is no measurement, {why}: {BROKEN}") from None
         if last:  # without an end: the run was killed while it wrote
             try:
-                log.measurements.append(parsed(last))
+                parsed(last)
+                lines.append(last)
             except ValueError:
                 log.torn_lines = 1
-        log._check(path)
-        return log
-
-    def _check(self, path: Path | str) -> None:
-        most = FEW + self._num_bytes // BYTES_OF_A_NUMBER
-        for number, measurement in enumerate(self.measurements, 1):
+        most = FEW + len(content) // BYTES_OF_A_NUMBER
+        for number, line in enumerate(lines, 1):
             try:
+                measurement = parsed(line)
                 check(measurement, most)
+            except json.JSONDecodeError as error:
+                why = f"{error.msg} at character {error.pos + 1}"
+                raise ValueError(f"{path}: line {number} is no measurement, {why}: {BROKEN}") from None
             except ValueError as error:
                 raise ValueError(f"{path}: line {number}: {error}: {BROKEN}") from None
-        for run in self.of_kind("run"):
+            log.measurements.append(measurement)
+        for run in log.of_kind("run"):
             schema = run.get("schema", SCHEMA)
             newer = f"{path} has schema {schema}, this version reads {SCHEMA}: update ctgraph_rl"
             require((schema <= SCHEMA, newer))
+        return log
 
     @classmethod
     def begun(cls, path: Path | str) -> NamedValues | None:
