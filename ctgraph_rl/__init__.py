@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from ctgraph_rl.tasks.images import PaperImages as PaperImages
     from ctgraph_rl.tasks.images import ReferenceImages as ReferenceImages
     from ctgraph_rl.tasks.images import ReferenceOneHot as ReferenceOneHot
-    from ctgraph_rl.tasks.images.measures import count_repeats as count_repeats
-    from ctgraph_rl.tasks.images.measures import distances as distances
     from ctgraph_rl.tasks.kinds.gym_task import GymTask as GymTask
     from ctgraph_rl.tasks.kinds.task_like import TaskLike as TaskLike
     from ctgraph_rl.tasks.observations import Observations as Observations
@@ -70,7 +68,6 @@ _EXPORTS = {
     "runs.recorder": ("Recorder",),
     "tasks.curriculum": ("Curriculum",),
     "tasks.images": ("GroupedImages", "ImageFile", "OneHot", "PaperImages", "ReferenceImages", "ReferenceOneHot"),
-    "tasks.images.measures": ("count_repeats", "distances"),
     "tasks.kinds.gym_task": ("GymTask",),
     "tasks.kinds.task_like": ("TaskLike",),
     "tasks.observations": ("Observations",),

@@ -14,7 +14,7 @@ from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from ctgraph_rl.tasks.task import Task
 from curricula.axes import OneOrMore, Tasks, all_goals, cycle, given_goals, random_goals, reshaped, sequence
 from curricula.draws import below, generator
-from curricula.published import environment, full_mdp, goal_of
+from curricula.published import full_mdp, goal_of, lab_task
 
 SWOKS = "Dick et al. 2024, CoLLAs, arXiv 2405.19047; github.com/JupiLogy/swoks"
 PENN_A = "Ben-Iwhiwhu et al. 2020, GECCO; github.com/dlpbc/penn-a"
@@ -69,9 +69,7 @@ def penn_a_swap(
         ),
         (num_lives is None or num_frames is None, "num_frames is of one life: leave it out with num_lives"),
     )
-    unique = (False, False)
-    config = environment(depth, (2, 2), (3, 3), (4, 4), fail_reward=-0.4, unique=unique)
-    task = Task.from_json(config, (1,) * depth)
+    task = lab_task("0" * depth, (2, 2), (3, 3), (4, 4), fail_reward=-0.4, unique_decisions=False, unique_waits=False)
     episode = _longest_episode(depth) * num_rows
     evaluation = None
     if num_lives is None:

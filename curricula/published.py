@@ -1,7 +1,7 @@
 """Common parts of the published sequences: the labs' environments, task ids and evaluation.
 
 The labs write a goal as a string of 0 and 1, and a task with its image seed before it: ``2:110`` is the goal 2.2.1
-with the images of seed 2. Environments are as `Task.from_json` reads their files.
+with the images of seed 2. Tasks are as `Task.from_json` reads their files.
 """
 
 from __future__ import annotations
@@ -9,8 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from ctgraph_rl.checks import NamedValues, is_int, require
+from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.images import ReferenceImages, ReferenceOneHot
+from ctgraph_rl.tasks.observations import Ids, Observations
 from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from ctgraph_rl.tasks.task import Task
 from curricula.axes import Tasks, sequence
@@ -28,64 +31,57 @@ The modulating-masks code and its successors have this protocol. The evaluation 
 """
 
 
-def environment(
-    depth: int,
-    wait_ids: Sequence[int],
-    decision_ids: Sequence[int],
-    end_ids: Sequence[int],
-    image_seed: int = 1,
-    fail_reward: float = 0.0,
-    unique: tuple[bool, bool] = (True, True),
-    one_hot: bool = False,
-) -> NamedValues:
-    """A file as the labs have them: b=2, p=0, one goal, reward 1, no noise, consecutive ids.
-
-    ``unique``: decision states, and wait states, have their own images.
-    """
-    return {
-        "graph_shape": {"d": depth, "b": 2, "p": 0.0},
-        "reward": {
-            "high_r": 1.0,
-            "fail_r": fail_reward,
-            "std_r": 0.0,
-            "min_static_reward_episodes": 0,
-            "max_static_reward_episodes": 0,
-            "reward_distribution": "needle_in_haystack",
-        },
-        "observations": {
-            "MDP_D": unique[0],
-            "MDP_W": unique[1],
-            "W_IDs": list(wait_ids),
-            "D_IDs": list(decision_ids),
-            "graph_ends": list(end_ids),
-        },
-        "image_dataset": {
-            "seed": image_seed,
-            "1D": one_hot,
-            "nr_of_images": end_ids[1] + 1,
-            "noise_on_read": 0,
-            "rotation_on_read": 1,
-        },
-    }
-
-
 def goal_of(path: str) -> tuple[int, ...]:
     """The goal of a path: ``011`` as 1.2.2."""
     return tuple(int(branch) + 1 for branch in path)
 
 
+def lab_task(
+    path: str,
+    wait_ids: Ids,
+    decision_ids: Ids,
+    end_ids: Ids,
+    image_seed: int = 1,
+    fail_reward: float = 0.0,
+    unique_decisions: bool = True,
+    unique_waits: bool = True,
+    one_hot: bool = False,
+) -> Task:
+    """A task as the labs' files have them: b=2, p=0, one goal, reward 1, no noise, consecutive ids."""
+    count = end_ids[1] + 1
+    observations = Observations(
+        wait_ids,
+        decision_ids,
+        end_ids,
+        unique_waits=unique_waits,
+        unique_decisions=unique_decisions,
+        reward_cue=True,
+        legacy_index=True,
+        noise_before_rotation=True,
+        cue_wraps=True,
+    )
+    return Task(
+        CTGraph(2, len(path)),
+        goal_of(path),
+        observations,
+        ReferenceOneHot(count) if one_hot else ReferenceImages(count, image_seed),
+        fail_reward=fail_reward,
+        reward_noise="multiplicative",
+        extra_end_step=True,
+    )
+
+
 def one_wait_image(path: str, image_seed: int) -> Task:
     """A task of the ``pomdp_wait`` environments: one image for all wait states, one for each other state."""
     n = 2 ** len(path)
-    config = environment(len(path), (2, 2), (3, n + 1), (n + 2, 2 * n + 1), image_seed, unique=(True, False))
-    return Task.from_json(config, goal_of(path))
+    return lab_task(path, (2, 2), (3, n + 1), (n + 2, 2 * n + 1), image_seed, unique_waits=False)
 
 
 def full_mdp(path: str, image_seed: int, fail_reward: float = 0.0, one_hot: bool = False) -> Task:
     """A task of the fully observable environments: an image, or a vector, per state."""
     n = 2 ** len(path)
     ids = (2, 2 * n), (2 * n + 1, 3 * n - 1), (3 * n, 4 * n - 1)
-    return Task.from_json(environment(len(path), *ids, image_seed, fail_reward, one_hot=one_hot), goal_of(path))
+    return lab_task(path, *ids, image_seed, fail_reward, one_hot=one_hot)
 
 
 def words(listing: str) -> NamedTasks:

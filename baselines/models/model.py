@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import torch
@@ -129,32 +129,3 @@ def learned_share(model: Predictor, test: Transitions, task: Task, policy: str =
     exact = transition_entropy(task, policy)
     frequencies = transition_entropy(task, policy, informed=False)
     return 1 - (model.bits(test).double().mean().item() - exact) / (frequencies - exact)
-
-
-def performance_matrix(make: Callable[[Symbols], Predictor], tasks: Sequence[Task], num_steps: int = 256) -> Tensor:
-    """Return `learned_share` of each task after each was learned in order, float64 [tasks + 1, tasks].
-
-    Metrics of the performance matrix take it, such as ``forgetting(matrix, [[0], [1]])``. Data are of a policy that
-    navigates; test data have another seed.
-
-    Args:
-        make: builds the predictor of symbols, such as `baselines.models.table_model.TableModel`.
-        num_steps: steps of each of 64 rows to learn from, and as many to test.
-
-    Example:
-        >>> from baselines.models.table_model import TableModel
-        >>> from ctgraph_rl.metrics import forgetting
-        >>> from ctgraph_rl.tasks.configurations import ct_fo_b1
-        >>> tasks = [ct_fo_b1(goal="1.1"), ct_fo_b1(goal="2.2")]
-        >>> round(forgetting(performance_matrix(TableModel, tasks), [[0], [1]]).value, 2) > 0
-        True
-    """
-    symbols = Symbols(tasks)
-    model = make(symbols)
-    test = [experience(task, symbols, num_steps=num_steps, seed=1) for task in tasks]
-    rows = []
-    for learned in (None, *tasks):
-        if learned is not None:
-            model.learn(experience(learned, symbols, num_steps=num_steps))
-        rows.append([learned_share(model, each, task) for each, task in zip(test, tasks, strict=True)])
-    return torch.tensor(rows, dtype=torch.float64, device="cpu")

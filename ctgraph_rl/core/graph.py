@@ -141,16 +141,9 @@ class CTGraph:
         """P_R: the probability that a uniformly random policy reaches one given end state.
 
         (b + 1) * ((1 - p) / ((b + 1) (b + 1 - p)))^(d + 1), the paper's closed form, correctly rounded. 0.0 below the
-        smallest float, where `log_reward_prob_random` serves.
+        smallest float, where `exact_reward_prob_random` serves.
         """
         return float(self.exact_reward_prob_random)
-
-    @property
-    def log_reward_prob_random(self) -> float:
-        """ln P_R, finite for every graph."""
-        b = self.branching_factor
-        p = self.wait_prob
-        return math.log(b + 1) + (self.depth + 1) * (math.log1p(-p) - math.log(b + 1) - math.log(b + 1 - p))
 
     @property
     def end_prob_random(self) -> float:

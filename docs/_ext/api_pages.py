@@ -36,7 +36,6 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "ctgraph_rl.tasks.memory",
             "ctgraph_rl.tasks.curriculum:Stream",
             "ctgraph_rl.tasks.images.image_set",
-            "ctgraph_rl.tasks.images.measures",
             "ctgraph_rl.tasks.switch",
             "ctgraph_rl.tasks.values",
             "ctgraph_rl.tasks.similarity",

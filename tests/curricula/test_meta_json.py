@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers.lab_files import environment
 
 import curricula
 from ctgraph_rl import CTGraph, Task
 from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from curricula import meta_json
 from curricula.meta_json import MOST_BYTES, place_of
-from curricula.published import environment, one_wait_image
+from curricula.published import one_wait_image
 
 OLD_KEYS = {
     "d": "depth",

@@ -6,6 +6,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import pytest
+from helpers.lab_files import environment
 from helpers.task_families import listing
 
 import curricula
@@ -14,7 +15,7 @@ from ctgraph_rl.tasks.configurations import ct_graph
 from ctgraph_rl.tasks.images import ReferenceImages, ReferenceOneHot
 from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from ctgraph_rl.tasks.switch import Drift
-from curricula.published import full_mdp, labelled, one_wait_image, pool_ids, words
+from curricula.published import full_mdp, lab_task, labelled, one_wait_image, pool_ids, words
 
 EVERY_5120 = Evaluation(num_episodes=10, greedy=True, every=5120)
 
@@ -362,3 +363,14 @@ def test_tasks_of_the_task_free_protocol_differ_in_goals_in_inputs_or_in_both():
     assert labels["both"] == ("goal1.1-img1", "goal1.2-img2", "goal2.1-img3", "goal2.2-img4")
     with pytest.raises(ValueError, match="differ must be one of goals, inputs, both, got 'images'"):
         curricula.load("task_free_abrupt", differ="images")
+
+
+@pytest.mark.parametrize("unique", [(True, True), (True, False), (False, False)])
+@pytest.mark.parametrize("one_hot", [False, True])
+def test_a_task_of_a_lab_is_that_of_its_file(unique, one_hot):
+    ids = (2, 8), (9, 11), (12, 15)
+
+    task = lab_task("01", *ids, 3, -0.4, unique_decisions=unique[0], unique_waits=unique[1], one_hot=one_hot)
+
+    file = environment(2, *ids, image_seed=3, fail_reward=-0.4, unique=unique, one_hot=one_hot)
+    assert task == Task.from_json(file, "1.2")

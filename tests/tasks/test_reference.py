@@ -12,7 +12,6 @@ from ctgraph_rl import (
     ReferenceImages,
     ReferenceOneHot,
     Task,
-    count_repeats,
 )
 from ctgraph_rl.core.rotation import rotate
 
@@ -105,26 +104,12 @@ def test_the_largest_seed_and_noise_are_accepted():
     assert int(images.images.max()) == 0
 
 
-def test_repeats_are_the_images_that_equal_an_earlier_one():
-    images = torch.tensor([1, 2, 1, 3, 2, 1], dtype=torch.uint8).view(6, 1, 1).expand(6, 4, 4)
-
-    repeats = count_repeats(images)
-
-    assert repeats == 3
-
-
 def test_reference_sets_keep_their_repeats_and_the_paper_sets_have_none():
     sets = ReferenceImages(5, noise=254), ReferenceImages(40), PaperImages(40)
 
-    repeats = [count_repeats(images.images) for images in sets]
+    repeats = [len(images.images) - len(images.images.unique(dim=0)) for images in sets]
 
     assert repeats == [4, 0, 0]
-
-
-@pytest.mark.parametrize("images", [torch.zeros(2, 3, 3), torch.zeros(3, 3, dtype=torch.uint8)])
-def test_repeats_are_counted_among_images_only(images):
-    with pytest.raises(ValueError, match=r"images must be uint8 \[n, r, r\] with n >= 1, got"):
-        count_repeats(images)
 
 
 def test_the_reference_one_hot_is_254_at_the_id_and_has_a_last_element_for_the_cue():

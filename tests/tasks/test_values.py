@@ -38,17 +38,17 @@ def test_random_probabilities_are_the_closed_forms_correctly_rounded(b, d, p):
 
     assert graph.reward_prob_random == exact.numerator / exact.denominator
     assert graph.end_prob_random == (b**d * exact).numerator / exact.denominator
-    assert math.exp(graph.log_reward_prob_random) == pytest.approx(float(exact), rel=1e-13, abs=0)
+    assert graph.exact_reward_prob_random == exact
 
 
-def test_log_probabilities_hold_at_b_3_d_30_p_999_and_where_floats_end():
+def test_the_exact_probability_holds_at_b_3_d_30_p_999_and_where_floats_end():
     deep, beyond = CTGraph(3, 30, 0.999), CTGraph(2, 60, 1 - 2**-30)
 
     expected = [math.log(4) + 31 * math.log(1 / (4 * 3001)), math.log(3) - 61 * math.log(3 * (2 * 2**30 + 1))]
 
-    assert deep.log_reward_prob_random == pytest.approx(expected[0], rel=1e-13)
+    exact = beyond.exact_reward_prob_random
     assert math.log(deep.reward_prob_random) == pytest.approx(expected[0], rel=1e-13)
-    assert beyond.log_reward_prob_random == pytest.approx(expected[1], rel=1e-13)
+    assert math.log(exact.numerator) - math.log(exact.denominator) == pytest.approx(expected[1], rel=1e-13)
     assert beyond.reward_prob_random == 0.0
 
 

@@ -6,7 +6,6 @@ A user's own kind satisfies `ImageSet`, and yaml reaches it through ``_target_``
 from ctgraph_rl.tasks.images.generated import GroupedImages, PaperImages
 from ctgraph_rl.tasks.images.image_file import ImageFile
 from ctgraph_rl.tasks.images.image_set import ImageSet, has_cue_element, white_level
-from ctgraph_rl.tasks.images.measures import Distances, count_repeats, distances
 from ctgraph_rl.tasks.images.one_hot import OneHot
 from ctgraph_rl.tasks.images.reference_images import ReferenceImages, ReferenceOneHot
 
@@ -14,7 +13,6 @@ IMAGE_SETS = (PaperImages, GroupedImages, OneHot, ImageFile, ReferenceImages, Re
 
 __all__ = [
     "IMAGE_SETS",
-    "Distances",
     "GroupedImages",
     "ImageFile",
     "ImageSet",
@@ -22,8 +20,6 @@ __all__ = [
     "PaperImages",
     "ReferenceImages",
     "ReferenceOneHot",
-    "count_repeats",
-    "distances",
     "has_cue_element",
     "white_level",
 ]

@@ -79,9 +79,9 @@ class GroupedImages(SquareImages):
 
         within = D (1 - (1 - s_i)^2),    between = D (1 - (1 - s_i)^2 (1 - s_g)^2)
 
-    are the expected distances within and between groups. The values of a seed are in `distances`; more cells come
-    closer. A share s of n cells is s n, rounded up or down at random; so the least ``within`` is
-    D (1 - (1 - 1 / c^2)^2), for one cell. No image occurs twice. Longer groups begin with the shorter ones.
+    are the expected distances within and between groups; more cells come closer. A share s of n cells is s n, rounded
+    up or down at random; so the least ``within`` is D (1 - (1 - 1 / c^2)^2), for one cell. No image occurs twice.
+    Longer groups begin with the shorter ones.
 
     Args:
         groups: number of images of each group.
@@ -132,14 +132,6 @@ class GroupedImages(SquareImages):
     def num_images(self) -> int:
         """Images of all groups."""
         return sum(self.groups)
-
-    @property
-    def group_of(self) -> tuple[int, ...]:
-        """The group of each id, from 0, as `distances` takes it."""
-        found: list[int] = []
-        for group, size in enumerate(self.groups):
-            found += [group] * size
-        return tuple(found)
 
     @property
     def images(self) -> Tensor:

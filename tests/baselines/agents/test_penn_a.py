@@ -10,6 +10,7 @@ from functools import partial
 
 import pytest
 import torch
+from helpers.lab_files import environment
 from helpers.scripted import DECISION_ID, ONE, decide, task
 from helpers.small_agents import GREEDY, SAMPLED
 from scipy.stats import kstest
@@ -33,7 +34,6 @@ from ctgraph_rl import Block, CTGraph, CTGraphEnv, Curriculum, Evaluation, Proto
 from ctgraph_rl.learn.collect import collect
 from ctgraph_rl.runs.train import new_agent
 from curricula.axes import all_goals
-from curricula.published import environment
 
 SETTINGS = {
     "num_envs": 16,

@@ -1,4 +1,4 @@
-"""Distances between the images of a set, and the number of repeats."""
+"""Distances between the images of a set."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import require
-from ctgraph_rl.tasks.images.image_set import WHITE, first_of_each
+from ctgraph_rl.tasks.images.image_set import WHITE
 
 
 class Distances(NamedTuple):
@@ -31,11 +30,6 @@ def distances(images: Tensor, groups: Sequence[int]) -> Distances:
         groups: the group of each image, from 0 without a gap.
     """
     numbers = sorted(set(groups))
-    require(
-        (images.dtype == torch.uint8 and images.ndim == 3, f"images must be uint8 [n, r, r], got {images.dtype}"),
-        (len(groups) == len(images), f"groups must have one entry for each of {len(images)} images, got {len(groups)}"),
-        (numbers == list(range(len(numbers))), f"groups must be numbered from 0 without a gap, got {numbers}"),
-    )
     group_of = torch.tensor(groups, device=images.device, dtype=torch.int64)
     count = images[0].numel()
     counts = []
@@ -54,10 +48,3 @@ def distances(images: Tensor, groups: Sequence[int]) -> Distances:
         return (sums[where].sum() / pairs[where].sum()).item()
 
     return Distances(mean(same), mean(~same), sums / pairs)
-
-
-def count_repeats(images: Tensor) -> int:
-    """Return how many of uint8 [n, r, r] images equal an earlier one."""
-    fits = images.dtype == torch.uint8 and images.ndim == 3 and len(images) > 0
-    require((fits, f"images must be uint8 [n, r, r] with n >= 1, got {images.dtype} {list(images.shape)}"))
-    return len(images) - len(first_of_each(images))
