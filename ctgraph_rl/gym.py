@@ -380,7 +380,7 @@ class StreamVectorEnv(CTGraphVectorEnv):
         num_envs: rows; a frame is one row for one step.
         stream: a `Stream`; None: ``curriculum=stream`` with ``settings``.
         seed: draws the tasks of a stream without a seed.
-        render_mode: as in `CTGraphVectorEnv`, also ``autoreset_mode``, ``kernel`` and ``life``.
+        task_ids: as in `CTGraphVectorEnv`, also all others but the tasks.
         settings: such as ``num_tasks=1000``.
 
     Raises:
@@ -399,6 +399,8 @@ class StreamVectorEnv(CTGraphVectorEnv):
         stream: Stream | None = None,
         *,
         seed: int = 0,
+        task_ids: Mapping[Task, int] | None = None,
+        num_task_ids: int | None = None,
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         kernel: str = "auto",
@@ -416,6 +418,8 @@ class StreamVectorEnv(CTGraphVectorEnv):
             num_envs,
             self.stream.tasks[0],
             task_pool=self.stream.tasks,
+            task_ids=task_ids,
+            num_task_ids=num_task_ids,
             render_mode=render_mode,
             autoreset_mode=autoreset_mode,
             kernel=kernel,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from ctgraph_rl.checks import NamedValues, Rule, require, takes_numbers
-from ctgraph_rl.gym import CTGraphVectorEnv, StreamVectorEnv, add_id, add_task_ids
+from ctgraph_rl.gym import CTGraphVectorEnv, StreamVectorEnv
 from ctgraph_rl.tasks.curriculum import Stream
-from ctgraph_rl.tasks.task import Task
 
 try:
     from stable_baselines3.common.vec_env import VecEnv
@@ -33,9 +32,6 @@ class SB3VecEnv(VecEnv):
 
     Args:
         task: as in `CTGraphVectorEnv`, also all others but the autoreset mode.
-        task_ids: the id of each task of the pool, such as ``curriculum.task_ids``. Observations are then a dict of
-            ``observation`` and ``task_id``, uint8 [num_envs, num_task_ids]: the row's id as one-hot.
-        num_task_ids: length of ``task_id``; None: just enough.
         stream: as in `StreamVectorEnv`, in place of ``task``.
 
     Example:
@@ -45,27 +41,14 @@ class SB3VecEnv(VecEnv):
     """
 
     @takes_numbers
-    def __init__(
-        self,
-        num_envs: int,
-        task: Any = None,
-        task_ids: Mapping[Task, int] | None = None,
-        num_task_ids: int | None = None,
-        stream: Stream | None = None,
-        **kwargs: Any,
-    ) -> None:
+    def __init__(self, num_envs: int, task: Any = None, stream: Stream | None = None, **kwargs: Any) -> None:
         same_step = AutoresetMode.SAME_STEP
         if stream is None:
             self.envs = CTGraphVectorEnv(num_envs, task, autoreset_mode=same_step, **kwargs)
         else:
             self.envs = StreamVectorEnv(num_envs, stream, autoreset_mode=same_step, **kwargs)
-        alone = self.envs.single_observation_space
-        space, self._ids = add_task_ids(alone, self.envs.task_pool, task_ids, num_task_ids)
-        super().__init__(num_envs, space, self.envs.single_action_space)
+        super().__init__(num_envs, self.envs.single_observation_space, self.envs.single_action_space)
         self.metadata = self.envs.metadata
-
-    def _shown(self, observation: NDArray[np.uint8], tasks: Any) -> Any:
-        return add_id(observation, self._ids, tasks)
 
     def reset(self) -> Any:
         """Start an episode in all rows, with the seeds of ``seed``."""
@@ -73,7 +56,7 @@ class SB3VecEnv(VecEnv):
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = _by_row(infos)
-        return self._shown(observation, infos["task"])
+        return observation
 
     @override
     def step_async(self, actions: NDArray[np.int64]) -> None:
@@ -92,9 +75,8 @@ class SB3VecEnv(VecEnv):
             final = _by_row(batch["final_info"])
             for i in ended:
                 self.reset_infos[i] = begun[i]
-                last = self._shown(batch["final_obs"][i], final[i]["task"])
-                infos[i] |= final[i] | {"terminal_observation": last}
-        return self._shown(observation, batch["task"]), rewards.astype(np.float32), done, infos
+                infos[i] |= final[i] | {"terminal_observation": batch["final_obs"][i]}
+        return observation, rewards.astype(np.float32), done, infos
 
     @override
     def close(self) -> None:
@@ -107,9 +89,8 @@ class SB3VecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """An attribute of the batch, repeated for every row; spaces are of one row."""
-        name = {"action_space": "single_action_space"}
-        owner = self if attr_name == "observation_space" else self.envs
-        found = getattr(owner, attr_name if owner is self else name.get(attr_name, attr_name))
+        name = f"single_{attr_name}" if attr_name in ("observation_space", "action_space") else attr_name
+        found = getattr(self.envs, name)
         return [found for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:

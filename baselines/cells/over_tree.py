@@ -6,27 +6,23 @@ It multiplies for all histories at once where PyTorch's does each step's operati
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-from typing_extensions import override
 
 from baselines.cells.cell import CellState
 from ctgraph_rl.learn.histories import Tree
 
-Kept = tuple[Tensor, ...]
-"""What the gradients of steps are made of, [n, ...] each."""
 
+class LSTMGates:
+    """i, f, g and o of an LSTM with the state h and c: a step without its products, and its gradients."""
 
-class Gates(Protocol):
-    """A step of a cell without its products, and its gradients."""
-
-    num_kept: ClassVar[int]
+    num_kept = 2
     """Tensors that `step` keeps, [n, H] each."""
 
-    adds: ClassVar[bool]
+    adds = True
     """Whether a step reads only the sum of its two products, so that they have one gradient."""
 
     @staticmethod
@@ -42,34 +38,6 @@ class Gates(Protocol):
             after: the next state, to be written.
             kept: to be written.
         """
-        ...
-
-    @staticmethod
-    def factors(carried: Tensor, kept: Sequence[Tensor], before: Sequence[Tensor]) -> CellState:
-        """Return what gradients of any number of steps are multiplied by."""
-        ...
-
-    @staticmethod
-    def back(factors: Sequence[Tensor], by: Sequence[Tensor], by_given: Tensor, by_carried: Tensor) -> CellState:
-        """Write gradients by ``given`` and ``carried``; return those by the state, without that through ``carried``.
-
-        Args:
-            by: gradients by the parts of the next state.
-        """
-        ...
-
-
-class LSTMGates(Gates):
-    """i, f, g and o of an LSTM with the state h and c."""
-
-    num_kept = 2
-    adds = True
-
-    @override
-    @staticmethod
-    def step(
-        given: Tensor, carried: Tensor, before: Sequence[Tensor], after: Sequence[Tensor], kept: Sequence[Tensor]
-    ) -> None:
         g, squashed = kept
         h, c = after
         carried.add_(given)
@@ -79,9 +47,9 @@ class LSTMGates(Gates):
         torch.tanh(c, out=squashed)
         torch.mul(o, squashed, out=h)
 
-    @override
     @staticmethod
     def factors(carried: Tensor, kept: Sequence[Tensor], before: Sequence[Tensor]) -> CellState:
+        """Return what gradients of any number of steps are multiplied by."""
         g, squashed = kept
         i, f, _, o = carried.chunk(4, dim=1)
         of_gates = (1 - carried).mul_(carried)
@@ -92,9 +60,13 @@ class LSTMGates(Gates):
         of_o.mul_(squashed)
         return of_gates, o * (1 - squashed.square()), f
 
-    @override
     @staticmethod
     def back(factors: Sequence[Tensor], by: Sequence[Tensor], by_given: Tensor, by_carried: Tensor) -> CellState:
+        """Write gradients by ``given`` and ``carried``; return those by the state, without that through ``carried``.
+
+        Args:
+            by: gradients by the parts of the next state.
+        """
         of_gates, of_h, f = factors
         by_h, by_c = by
         by_c = torch.addcmul(by_c, by_h, of_h)
@@ -102,26 +74,26 @@ class LSTMGates(Gates):
         return torch.zeros_like(by_h), by_c * f
 
 
-class GRUGates(Gates):
-    """r, z and n of a GRU with the state h."""
+class GRUGates:
+    """r, z and n of a GRU with the state h; members as of `LSTMGates`."""
 
     num_kept = 1
     adds = False
 
-    @override
     @staticmethod
     def step(
         given: Tensor, carried: Tensor, before: Sequence[Tensor], after: Sequence[Tensor], kept: Sequence[Tensor]
     ) -> None:
+        """Write the next state, and what `factors` needs."""
         [n] = kept
         size = n.shape[1]
         r, z = carried[:, : 2 * size].add_(given[:, : 2 * size]).sigmoid_().chunk(2, dim=1)
         torch.tanh(torch.addcmul(given[:, 2 * size :], r, carried[:, 2 * size :]), out=n)
         torch.lerp(n, before[0], z, out=after[0])
 
-    @override
     @staticmethod
     def factors(carried: Tensor, kept: Sequence[Tensor], before: Sequence[Tensor]) -> CellState:
+        """Return what gradients are multiplied by."""
         [n] = kept
         r, z, of_h = carried.chunk(3, dim=1)
         of_n = (1 - z) * (1 - n.square())
@@ -129,9 +101,9 @@ class GRUGates(Gates):
         of_z = (before[0] - n) * z * (1 - z)
         return torch.cat([of_r, of_z, of_n], dim=1), torch.cat([of_r, of_z, of_n * r], dim=1), z
 
-    @override
     @staticmethod
     def back(factors: Sequence[Tensor], by: Sequence[Tensor], by_given: Tensor, by_carried: Tensor) -> CellState:
+        """Write gradients by ``given`` and ``carried``; return those by the state."""
         of_given, of_carried, z = factors
         by_gates = torch.cat([by[0], by[0], by[0]], dim=1)
         torch.mul(by_gates, of_given, out=by_given)
@@ -140,9 +112,9 @@ class GRUGates(Gates):
 
 
 class GatedTree(NamedTuple):
-    """Histories, and the cell of `Gates` over them."""
+    """Histories, and the gates of the cell over them."""
 
-    gates: type[Gates]
+    gates: type[LSTMGates] | type[GRUGates]
 
     tree: Tree
 
@@ -151,7 +123,7 @@ class GatedTree(NamedTuple):
 
 
 class GatesOverTree(torch.autograd.Function):
-    """Outputs of a cell of `Gates` at the ends of histories, differentiable once by products and weights."""
+    """Outputs of a gated cell at the ends of histories, differentiable once by products and weights."""
 
     @staticmethod
     def forward(

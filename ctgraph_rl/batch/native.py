@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import product
 from typing import NamedTuple
 
@@ -83,11 +83,11 @@ class Native:
         self.tables = tables
         self._call: _Call | None = None
         self._state: RowState | None = None
-        self._shapes: Stepped | None = None
+        self._shapes: dict[str, Tensor] = {}
 
     def __getstate__(self) -> NamedValues:
         """Copies start without what is prepared."""
-        return {"params": self.params, "tables": self.tables, "_call": None, "_state": None, "_shapes": None}
+        return {"params": self.params, "tables": self.tables, "_call": None, "_state": None, "_shapes": {}}
 
     def take(
         self, state: RowState, action: Tensor | None, mask: Tensor | None, shown: Tensor | None = None
@@ -99,14 +99,7 @@ class Native:
             mask: bool [N]; None: no row starts an episode.
             shown: uint8 [N, *shape], the last observations, if known and no row steps.
         """
-        n = len(self.tables.entry)
-        device = self.params.row.device
-        made = Shown(
-            torch.empty(n, *self.params.bank.shape[1:], dtype=torch.uint8, device=device),
-            torch.empty(n, dtype=torch.uint8, device=device),
-            torch.empty(n, dtype=torch.int64, device=device),
-            torch.empty(n, dtype=torch.bool, device=device),
-        )
+        made = Shown(*self._new_arrays(Shown._fields))
         return self.run(state, made=made, action=action, mask=mask, shown=shown), made
 
     def observe(
@@ -135,17 +128,17 @@ class Native:
         n = len(self.tables.entry)
         if action is None or action.dtype != torch.int64 or action.shape != (n,):
             return None
-        if self._shapes is None:
-            shapes = []
-            for name in Stepped._fields:
-                dtype, is_image, _ = _ARRAYS[name]
-                pixels = self.params.bank.shape[1:] if is_image else ()
-                one = torch.empty((), dtype=dtype, device=self.params.row.device)
-                shapes.append(one.expand(n, *pixels))
-            self._shapes = Stepped(*shapes)
-        made = Stepped(*map(torch.empty_like, self._shapes))
+        made = Stepped(*self._new_arrays(Stepped._fields))
         after, wrong = self._run(state, most_action=most_action, restarts=True, made=made, action=action)
         return None if wrong else (after, made)
+
+    def _new_arrays(self, names: Sequence[str]) -> Iterator[Tensor]:
+        if not self._shapes:
+            for name, (dtype, is_image, _) in _ARRAYS.items():
+                pixels = self.params.bank.shape[1:] if is_image else ()
+                one = torch.empty((), dtype=dtype, device=self.params.row.device)
+                self._shapes[name] = one.expand(len(self.tables.entry), *pixels)
+        return (torch.empty_like(self._shapes[name]) for name in names)
 
     def run(
         self,

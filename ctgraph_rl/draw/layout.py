@@ -153,13 +153,9 @@ def shown_ids(task: Task, state: Key, level: int) -> tuple[int, int]:
         level: the decisions taken before it.
     """
     kind, node = state
-    x = task.observations
-    graph = task.graph
-    first, last = x.ids(kind)
-    if not x.is_unique(kind):
-        return first, last
-    within_level = node - graph.first_node(level)
-    number = first + (x.first_of_level(graph, kind, level) + within_level) % (last - first + 1)
+    if not task.observations.is_unique(kind):
+        return task.observations.ids(kind)
+    number = task.observations.unique_id(task.graph, kind, level, node - task.graph.first_node(level))
     return number, number
 
 

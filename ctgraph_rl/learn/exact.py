@@ -391,14 +391,13 @@ class _Enumeration:
     ) -> tuple[_Histories, Tensor, Step]:
         """Return the histories split by images, and what `_Seeds.action_probs` returns."""
         x = self.task.observations
-        first, last = x.ids(kind)
         views = _num_views(self.task)
         count = len(histories.node)
         if x.is_unique(kind):
-            before = x.first_of_level(self.task.graph, kind, level)
-            ids = first + (before + histories.node - self.task.graph.first_node(level)) % (last - first + 1)
-            ids = ids.unsqueeze(1)
+            number = histories.node - self.task.graph.first_node(level)
+            ids = x.unique_id(self.task.graph, kind, level, number).unsqueeze(1)
         else:
+            first, last = x.ids(kind)
             ids = torch.arange(first, last + 1, device="cpu").expand(count, -1)
         images = (ids.unsqueeze(2) * views + torch.arange(views, device="cpu")).flatten(1)
         rows = torch.arange(count, device="cpu").repeat_interleave(images.shape[1])

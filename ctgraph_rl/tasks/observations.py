@@ -7,12 +7,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from itertools import combinations
-from typing import TypeGuard
+from typing import TypeGuard, TypeVar
+
+from torch import Tensor
 
 from ctgraph_rl.checks import Rule, as_tuple, is_int, make_fields_plain, require, true_or_false
 from ctgraph_rl.core.graph import CTGraph, StateType
 
 Ids = tuple[int, int]
+
+Number = TypeVar("Number", int, Tensor)
 
 MAX_READ_ROTATION = 359
 
@@ -109,11 +113,13 @@ class Observations:
         """Whether any kind of state shows an id drawn from several."""
         return any(not self.is_unique(kind) and self.ids(kind)[0] < self.ids(kind)[1] for kind in StateType)
 
-    def first_of_level(self, graph: CTGraph, kind: StateType, level: int) -> int:
-        """Return how many of a kind's unique ids precede a level of the tree, or the legacy number."""
+    def unique_id(self, graph: CTGraph, kind: StateType, level: int, number: Number) -> Number:
+        """Return the id of a state that has its own, by its number, or those of several, within a level of the tree."""
+        before = 0 if kind == StateType.END else graph.first_node(level)
         if self.legacy_index:
-            return graph.branching_factor**level - 1
-        return 0 if kind == StateType.END else graph.first_node(level)
+            before = graph.branching_factor**level - 1
+        first, last = self.ids(kind)
+        return first + (before + number) % (last - first + 1)
 
     def rules(self, graph: CTGraph) -> list[Rule]:
         """Return the rules on a graph: unique ids need an id per state."""

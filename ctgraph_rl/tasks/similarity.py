@@ -307,15 +307,12 @@ def _levels(task: Task, kind: StateType) -> range:
 
 
 def _unique_ids(task: Task, kind: StateType, level: int) -> list[int]:
-    x = task.observations
     graph = task.graph
     states = graph.num_states
     limit = MAX_ENUMERATED_STATES
     require((states <= limit, f"unique ids on this graph need a visit to each of its {states} states, limit {limit}"))
-    first, last = x.ids(kind)
-    before = x.first_of_level(graph, kind, level)
-    size = last - first + 1
-    return [first + (before + node) % size for node in range(graph.branching_factor**level)]
+    number = torch.arange(graph.branching_factor**level, device="cpu")
+    return task.observations.unique_id(graph, kind, level, number).tolist()
 
 
 def _contents(task: Task, ids: Sequence[int]) -> Iterator[bytes]:

@@ -382,13 +382,12 @@ class _Memoryless:
 
     def _action_probs(self, kind: StateType, level: int) -> Tensor:
         """float64 [..., b^level, A] by node where ids are unique, else [..., 1, A], the mean over ids."""
-        b = self.task.graph.branching_factor
-        first, last = self.task.observations.ids(kind)
-        if not self.task.observations.is_unique(kind):
+        x = self.task.observations
+        if not x.is_unique(kind):
+            first, last = x.ids(kind)
             return self.policy[..., first : last + 1, :].mean(-2, keepdim=True)
-        before = self.task.observations.first_of_level(self.task.graph, kind, level)
-        number = before + torch.arange(b**level, device="cpu")
-        return self.policy[..., first + number % (last - first + 1), :]
+        number = torch.arange(self.task.graph.branching_factor**level, device="cpu")
+        return self.policy[..., x.unique_id(self.task.graph, kind, level, number), :]
 
 
 def is_needle(task: Task) -> bool:

@@ -8,7 +8,7 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode
 
-import ctgraph_rl.gym  # noqa: F401, registers the ids
+import ctgraph_rl.gym
 import curricula
 
 ID = "ctgraph/Stream-v0"
@@ -36,6 +36,17 @@ def test_rows_change_to_the_next_task_when_their_episodes_end_after_a_block(mode
     again, infos = envs.reset(seed=0)
     assert (infos["task"].tolist(), again.tolist()) == ([0] * 4, first.tolist())
     assert stream.tasks[0] == envs.stream.tasks[0]
+
+
+def test_a_stream_shows_task_ids():
+    stream = curricula.load("stream", num_tasks=2, num_frames=8, depth=1, seed=5)
+    envs = ctgraph_rl.gym.StreamVectorEnv(4, stream, task_ids=stream.task_ids)
+    envs.reset(seed=0)
+
+    seen = [envs.step(np.zeros(4, np.int64))[0]["task_id"].tolist() for _ in range(8)]
+
+    assert seen[0] == [[1, 0]] * 4
+    assert seen[-1] == [[0, 1]] * 4
 
 
 def test_the_end_of_a_stream_is_told():

@@ -120,11 +120,11 @@ def test_values_of_policies_are_those_of_plain_recursion(task):
 
     def shown(state):
         kind, path = state
-        first, last = x.ids(kind)
         if not x.is_unique(kind):
+            first, last = x.ids(kind)
             return policy[first : last + 1].mean(0).tolist()
         number = task.graph.node_at(path) - task.graph.first_node(len(path))
-        return policy[first + (x.first_of_level(task.graph, kind, len(path)) + number) % (last - first + 1)].tolist()
+        return policy[x.unique_id(task.graph, kind, len(path), number)].tolist()
 
     assert task.policy_value(policy) == pytest.approx(
         value(task, table(task, shown)), rel=1e-6
