@@ -40,6 +40,7 @@ from baselines.parts.learner import MOST_PASSES, Learner
 from baselines.parts.networks import Data, Items, TensorsByName, draw, entropy, guided, is_greedy, num_actions_of
 from baselines.parts.q_learning import require_replay
 from baselines.update.update import make_optimiser
+from ctgraph_rl.batch.specs import TASK_NUMBER
 from ctgraph_rl.checks import (
     NamedValues,
     at_least_one,
@@ -253,6 +254,13 @@ class PEARL(Learner):
                 self.minibatch_size, self.settings.num_context, dtype=torch.float32, device=begins.device
             )
             yield {**self._steps(*trial, self.settings.batch_size), **context, "noise": noise}
+
+    @override
+    def shown_ids(self, batch: TensorDictBase) -> Tensor | None:
+        shown = super().shown_ids(batch)
+        if shown is None or not self.replay:
+            return shown
+        return torch.cat([shown, self.replay[TASK_NUMBER].flatten(), self.replay["next", TASK_NUMBER].flatten()])
 
     def _steps(self, row: Tensor, first: Tensor, last: Tensor, number: int) -> Items:
         share = torch.rand(len(row), number, dtype=torch.float32, device=row.device)

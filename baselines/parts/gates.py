@@ -7,7 +7,6 @@ s, 1 at 0, and ``none`` no gate. A hard gate has no gradient: it stays random, a
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any
 
 import torch
@@ -15,7 +14,8 @@ from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 
 from baselines.cells.cell import linear_layer
-from baselines.parts.networks import highest, require_weights
+from baselines.parts.networks import IdLinear, highest, require_weights
+from ctgraph_rl.batch.specs import TASK_NUMBER
 from ctgraph_rl.checks import require_memory
 
 GATES = ("none", "soft", "hard", "hard_straight_through")
@@ -25,27 +25,31 @@ class GatedLayer(nn.Module):
     """A linear layer with ReLU, and its gate.
 
     Args:
+        num_ids: of task ids among the inputs, as ``num_extra`` in `IdLinear`.
         gate: one of `GATES`.
         gate_size: width of W_n x.
     """
 
-    def __init__(self, num_inputs: int, num_outputs: int, gate: str, gate_size: int) -> None:
+    def __init__(
+        self, num_inputs: int, num_outputs: int, gate: str, gate_size: int, num_ids: int = 0, num_extra: int = 0
+    ) -> None:
         super().__init__()
         self.gate = gate
-        self.linear = linear_layer(num_inputs, num_outputs)
+        self.linear = IdLinear(num_inputs, num_ids, num_extra, num_outputs)
         self.modulator = nn.Sequential()
         if gate != "none":
-            layers = linear_layer(num_inputs, gate_size), nn.ReLU(), linear_layer(gate_size, num_outputs)
-            self.modulator.extend(layers)
+            first = IdLinear(num_inputs, num_ids, num_extra, gate_size)
+            self.modulator.extend([first, nn.ReLU(), linear_layer(gate_size, num_outputs)])
 
-    def forward(self, inputs: Tensor) -> Tensor:
-        """Map [..., num_inputs] to [..., num_outputs]."""
-        outputs = self.linear(inputs)
-        return outputs.relu() if self.gate == "none" else (outputs * self.gates(inputs)).relu()
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Map what `IdLinear` reads to [..., num_outputs]."""
+        outputs = self.linear(*inputs)
+        return outputs.relu() if self.gate == "none" else (outputs * self.gates(*inputs)).relu()
 
-    def gates(self, inputs: Tensor) -> Tensor:
+    def gates(self, *inputs: Tensor) -> Tensor:
         """Return g, [..., num_outputs]."""
-        drive = self.modulator(inputs)
+        first, relu, last = self.modulator
+        drive = last(relu(first(*inputs)))
         if self.gate == "soft":
             return drive.tanh()
         sign = torch.where(drive >= 0, 1.0, -1.0).to(drive.dtype)
@@ -58,6 +62,7 @@ class GatedNetwork(nn.Module):
     Args:
         shape: of one observation.
         high: largest value of an observation.
+        num_ids: number of task ids.
         num_extra: width of further inputs.
         hidden_size: width of each layer.
         num_layers: layers before the output, which has no gate.
@@ -69,6 +74,7 @@ class GatedNetwork(nn.Module):
         self,
         shape: torch.Size,
         high: float,
+        num_ids: int,
         num_extra: int,
         hidden_size: int,
         num_layers: int,
@@ -79,9 +85,9 @@ class GatedNetwork(nn.Module):
         super().__init__()
         self.event_dims = len(shape)
         self.scale = 1 / high
-        widths = [shape.numel() + num_extra, *[hidden_size] * num_layers]
-        layers = [GatedLayer(before, after, gate, gate_size) for before, after in pairwise(widths)]
-        self.layers = nn.Sequential(*layers)
+        self.layers = nn.ModuleList([GatedLayer(shape.numel(), hidden_size, gate, gate_size, num_ids, num_extra)])
+        for _ in range(num_layers - 1):
+            self.layers.append(GatedLayer(hidden_size, hidden_size, gate, gate_size))
         self.output = linear_layer(hidden_size, num_outputs)
         for name, parameter in self.named_parameters():
             if name.endswith("weight"):
@@ -90,23 +96,25 @@ class GatedNetwork(nn.Module):
                 nn.init.zeros_(parameter)
 
     def forward(self, observation: Tensor, *extra: Tensor) -> Tensor:
-        """Map observations [..., *shape] and further inputs, [..., n] each, to [..., num_outputs]."""
-        inputs = torch.cat([self.flat(observation), *(self.as_inputs(value) for value in extra)], dim=-1)
-        return self.output(self.layers(inputs))
+        """Map observations [..., *shape], and what `IdLinear` reads beside them, to [..., num_outputs]."""
+        hidden = self.flat(observation)
+        for layer in self.layers:
+            hidden = layer(hidden, *extra)
+            extra = ()
+        return self.output(hidden)
 
     def flat(self, observation: Tensor) -> Tensor:
         """Return observations as vectors in [0, 1]."""
-        return self.as_inputs(observation.flatten(-self.event_dims)) * self.scale
-
-    def as_inputs(self, values: Tensor) -> Tensor:
-        """Return values in the type of the weights."""
-        return values.to(self.output.weight.dtype)
+        return observation.flatten(-self.event_dims).to(self.output.weight.dtype) * self.scale
 
 
 def shown_specs(observation_spec: Composite) -> dict[str, TensorSpec]:
-    """Return the specs of what a network sees: the observation and, if there is one, the task id."""
-    shown = [key for key in ("observation", "task_id") if key in observation_spec.keys()]  # noqa: SIM118, no dict
-    return {key: observation_spec[key] for key in shown}
+    """Return the specs of what a network sees: the observation and the task's id, as a number where there is one."""
+    found = {"observation": observation_spec["observation"]}
+    for key in (TASK_NUMBER, "task_id"):
+        if len(found) == 1 and key in observation_spec.keys():  # noqa: SIM118, no dict
+            found[key] = observation_spec[key]
+    return found
 
 
 def gated_network(specs: dict[str, TensorSpec], num_extra: int, num_outputs: int, **sizes: Any) -> GatedNetwork:
@@ -115,9 +123,14 @@ def gated_network(specs: dict[str, TensorSpec], num_extra: int, num_outputs: int
     Args:
         specs: of what it sees.
     """
-    observation, *others = specs.values()
-    num_extra += sum(other.shape.numel() for other in others)
-    return GatedNetwork(observation.shape, highest(observation), num_extra, num_outputs=num_outputs, **sizes)
+    observation = specs["observation"]
+    num_ids = 0
+    if TASK_NUMBER in specs:
+        num_ids = int(specs[TASK_NUMBER].space.high) + 1
+    elif "task_id" in specs:
+        num_extra += specs["task_id"].shape.numel()
+    high = highest(observation)
+    return GatedNetwork(observation.shape, high, num_ids, num_extra, num_outputs=num_outputs, **sizes)
 
 
 def require_gated_weights(

@@ -39,7 +39,16 @@ from baselines.parts.learner import Learner
 from baselines.parts.networks import Data, Items, TensorsByName, draw, entropy, guided, is_greedy, num_actions_of
 from baselines.update.trust_region import trust_region_step
 from baselines.update.update import make_optimiser
-from ctgraph_rl.checks import at_least_one, fraction, make_fields_plain, not_negative, one_of, positive, require
+from ctgraph_rl.checks import (
+    at_least_one,
+    fraction,
+    make_fields_plain,
+    not_negative,
+    one_of,
+    positive,
+    require,
+    require_memory,
+)
 from ctgraph_rl.core.dynamics import beside
 from ctgraph_rl.learn.collect import UNSTORED
 
@@ -320,6 +329,9 @@ class InnerLoop(Learner):
             gate_size=given.gate_size,
         )
         model = self.make_model(net, given.inner_rate)
+        count = given.num_envs * sum(value.numel() for value in model.start(model.theta).values())
+        adapted = f"weights of each of num_envs={given.num_envs} rows, their gradients and what they become"
+        require_memory(adapted, 16 * count, "rows or smaller layers")
         self.policy = InnerPolicy(model, list(self.specs), given.adapt_episodes, given.gamma)
         self.optimiser = make_optimiser("adam", net.parameters(), given.learning_rate)
 

@@ -13,17 +13,17 @@ import torch
 from torch import Tensor
 
 from baselines.parts.hooks import Hooks, PlasticityHooks
-from baselines.parts.networks import Encoder, TensorsByName
+from baselines.parts.networks import IdLinear, TensorsByName
 from baselines.update.trained import Trained
 from baselines.update.update import MOMENTS, has_parts
 
 MANY_IDS = 1024
-"""Fewest ids of an encoder from which it learns without those that were never shown."""
+"""Fewest ids of a layer from which it learns without those that were never shown."""
 
 
 @contextmanager
 def only_live_ids(learner: Trained, shown: Tensor) -> Iterator[None]:
-    """Learn with the columns of ids that are shown or were; the encoders have all columns before and after.
+    """Learn with the columns of ids that are shown or were; the layers have all columns before and after.
 
     On GPUs, compiled, with a method, a plasticity, weight decay or another optimiser they keep all columns, as these
     may change any.
@@ -31,19 +31,21 @@ def only_live_ids(learner: Trained, shown: Tensor) -> Iterator[None]:
     Args:
         shown: from `baselines.parts.learner.Learner.shown_ids`.
     """
-    encoders = _encoders(learner) if _leaves_others(learner, shown) else []
-    if not encoders:
+    layers = _layers(learner) if _leaves_others(learner, shown) else []
+    if not layers:
         yield
         return
-    live = torch.zeros(encoders[0].num_ids, dtype=torch.bool, device="cpu")
+    live = torch.zeros(layers[0].num_ids, dtype=torch.bool, device="cpu")
     live[shown.clamp(min=0)] = True
-    tables = [_Table(encoder, learner.optimiser) for encoder in encoders]
+    tables = [_Table(layer, learner.optimiser) for layer in layers]
+    names = {id(value): name for name, value in learner.other_weights().items()}
     for table in tables:
         squares = table.moments.get(MOMENTS[type(learner.optimiser)][-1])
         if squares is not None:
             live |= table.of_ids(squares).sum(dim=0) != 0
-        if table is not tables[0]:  # what a target has not yet copied
-            live |= (table.of_ids(table.all_columns) != tables[0].of_ids(tables[0].all_columns)).any(dim=0)
+        if id(table.weight) in names:  # what a target has not yet copied
+            online = learner.get_parameter(names[id(table.weight)]).data
+            live |= (table.of_ids(table.all_columns) != table.of_ids(online)).any(dim=0)
     try:
         for table in tables:
             table.narrow(live.nonzero().squeeze(1))
@@ -59,20 +61,20 @@ def _leaves_others(learner: Trained, shown: Tensor) -> bool:
     return shown.is_cpu and is_plain and learner.compiled_step is None and has_parts(learner.optimiser) and not decays
 
 
-def _encoders(learner: Trained) -> list[Encoder]:
+def _layers(learner: Trained) -> list[IdLinear]:
     found = []
     for module in learner.modules():
-        if isinstance(module, Encoder) and module.num_ids >= MANY_IDS:
-            weight = module.linear.weight
+        if isinstance(module, IdLinear) and module.num_ids >= MANY_IDS:
+            weight = module.weight
             if not weight.requires_grad or any(weight is other for other in learner.weights):
                 found.append(module)
     return found
 
 
 class _Table:
-    def __init__(self, encoder: Encoder, optimiser: torch.optim.Optimizer) -> None:
-        self.encoder = encoder
-        self.weight = encoder.linear.weight
+    def __init__(self, layer: IdLinear, optimiser: torch.optim.Optimizer) -> None:
+        self.layer = layer
+        self.weight = layer.weight
         self.all_columns = self.weight.data
         self.optimiser = optimiser
         self.moments = self._moments()
@@ -83,18 +85,18 @@ class _Table:
 
     def of_ids(self, matrix: Tensor) -> Tensor:
         """Return the columns of ids, [num_features, num_ids]."""
-        return matrix.narrow(1, self.encoder.num_inputs, self.encoder.num_ids)
+        return matrix.narrow(1, self.layer.num_inputs, self.layer.num_ids)
 
     def narrow(self, live: Tensor) -> None:
         """Leave only the columns of live ids, int64 [n] in rising order."""
         kept = torch.ones(self.weight.shape[1], dtype=torch.bool, device="cpu")
-        kept.narrow(0, self.encoder.num_inputs, self.encoder.num_ids).zero_()
-        kept[self.encoder.num_inputs + live] = True
+        kept.narrow(0, self.layer.num_inputs, self.layer.num_ids).zero_()
+        kept[self.layer.num_inputs + live] = True
         self.columns = kept.nonzero().squeeze(1)
         self.weight.data = self.all_columns.index_select(1, self.columns)
         for key, value in self.moments.items():
             self.optimiser.state[self.weight][key] = value.index_select(1, self.columns)
-        self.encoder.live_ids = live
+        self.layer.live_ids = live
 
     def widen(self) -> None:
         """Put back all columns."""
@@ -103,4 +105,4 @@ class _Table:
         for key, value in self._moments().items():
             whole = self.moments[key] if key in self.moments else torch.zeros_like(self.all_columns)
             self.optimiser.state[self.weight][key] = whole.index_copy_(1, self.columns, value)
-        self.encoder.live_ids = None
+        self.layer.live_ids = None

@@ -83,6 +83,43 @@ class Convolutions(nn.Module):
         return self.second_relu(self.second(torch.cat(patches, dim=-1))).flatten(-3)
 
 
+class IdLinear(nn.Linear):
+    """A linear layer whose inputs may hold a task's id, which it reads as a number by gathering a column.
+
+    Args:
+        num_inputs: width of the inputs before the id.
+        num_ids: number of task ids, of which a number is read as a one-hot vector would be; 0: none is read.
+        num_extra: width of the inputs behind the id.
+    """
+
+    def __init__(self, num_inputs: int, num_ids: int, num_extra: int, num_outputs: int) -> None:
+        super().__init__(num_inputs + num_ids + num_extra, num_outputs, dtype=torch.float32, device="cpu")
+        self.num_inputs = num_inputs
+        self.num_ids = num_ids
+        self.live_ids: Tensor | None = None  # those whose columns the weight has, see `baselines.parts.live_ids`
+
+    def forward(self, inputs: Tensor, *extra: Tensor) -> Tensor:
+        """Map inputs, a task's number where ids are read, and further inputs.
+
+        Args:
+            inputs: [..., num_inputs] of the weights' dtype.
+            extra: int64 [..., 1], -1 for none, where ids are read; and further inputs, [..., n] each.
+        """
+        others = [values.to(self.weight.dtype) for values in extra[bool(self.num_ids) :]]
+        inputs = joined(inputs, *others)
+        if not self.num_ids:
+            return super().forward(inputs)
+        num_columns = self.num_ids if self.live_ids is None else len(self.live_ids)
+        of_inputs, of_ids, of_others = self.weight.tensor_split([self.num_inputs, self.num_inputs + num_columns], dim=1)
+        weight = torch.cat([of_inputs, of_others], dim=1) if others else of_inputs
+        number = extra[0].squeeze(-1)
+        column = number.clamp(min=0).flatten()
+        if self.live_ids is not None:
+            column = torch.searchsorted(self.live_ids, column)
+        of_number = of_ids.t().index_select(0, column).view(*number.shape, -1)
+        return nn.functional.linear(inputs, weight, self.bias) + of_number * (extra[0] >= 0)
+
+
 class Encoder(nn.Module):
     """Observations to features: scale uint8 to [0, 1], flatten, linear layers with ReLU.
 
@@ -90,7 +127,7 @@ class Encoder(nn.Module):
         shape: shape of one observation.
         high: largest value of an observation.
         num_features: width of every layer.
-        num_ids: number of task ids, of which a number is read as a one-hot vector would be; 0: none is read.
+        num_ids: number of task ids, as in `IdLinear`.
         kind: ``mlp``, or ``cnn`` with `Convolutions` before the linear layers.
     """
 
@@ -110,10 +147,7 @@ class Encoder(nn.Module):
         self.scale = 1 / high
         self.convolutions = Convolutions(shape) if kind == "cnn" else None
         num_inputs = shape.numel() if self.convolutions is None else self.convolutions.num_features
-        self.num_inputs = num_inputs
-        self.num_ids = num_ids
-        self.live_ids: Tensor | None = None  # those whose columns the weight has, see `baselines.parts.live_ids`
-        self.linear = linear_layer(num_inputs + num_ids + num_extra, num_features)
+        self.linear = IdLinear(num_inputs, num_ids, num_extra, num_features)
         self.relu = nn.ReLU()
         self.further = nn.Sequential()
         for _ in range(num_layers - 1):
@@ -145,22 +179,7 @@ class Encoder(nn.Module):
         inputs = observation.flatten(-self.event_dims).to(dtype) * self.scale
         if self.convolutions is not None:
             inputs = self.convolutions(inputs)
-        others = [values.to(dtype) for values in extra[bool(self.num_ids) :]]
-        inputs = joined(inputs, *others)
-        if not self.num_ids:
-            return self.further(self.relu(self.linear(inputs)))
-        num_columns = self.num_ids if self.live_ids is None else len(self.live_ids)
-        of_inputs, of_ids, of_others = self.linear.weight.tensor_split(
-            [self.num_inputs, self.num_inputs + num_columns], dim=1
-        )
-        weight = torch.cat([of_inputs, of_others], dim=1) if others else of_inputs
-        number = extra[0].squeeze(-1)
-        column = number.clamp(min=0).flatten()
-        if self.live_ids is not None:
-            column = torch.searchsorted(self.live_ids, column)
-        of_number = of_ids.t().index_select(0, column).unflatten(0, number.shape)
-        hidden = nn.functional.linear(inputs, weight, self.linear.bias) + of_number * (extra[0] >= 0)
-        return self.further(self.relu(hidden))
+        return self.further(self.relu(self.linear(inputs, *extra)))
 
 
 class EncoderModule(TensorDictModule):
@@ -328,6 +347,8 @@ def require_weights(
         ValueError: names the layers and the bytes.
     """
     num_inputs = observation_spec["observation"].shape.numel()
+    if "task_id" in observation_spec.keys():  # noqa: SIM118, no dict
+        num_inputs += observation_spec["task_id"].shape.numel()
     squares = num_layers - 1 + (8 if memory else 0)
     count = hidden_size * (num_inputs + squares * hidden_size + num_outputs)
     require_memory(f"weights of hidden_size={hidden_size} in num_layers={num_layers}", 16 * count, "or smaller layers")

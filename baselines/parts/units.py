@@ -72,7 +72,7 @@ def hidden_layers(policy: nn.Module) -> list[HiddenLayer]:
     for units, after in pairwise(chain):
         is_channel = encoder.convolutions is not None and after.linear not in encoder.further
         apart = units.linear.out_features if is_channel else None
-        within = encoder.num_inputs if after.linear is encoder.linear else None
+        within = encoder.linear.num_inputs if after.linear is encoder.linear else None
         found.append(_layer(units, [(after.linear.weight, after.linear.bias)], apart, within))
     if recurrent:
         found.append(_layer(chain[-1], trunk.cell.input_layers(), trunk.cell.num_inputs))

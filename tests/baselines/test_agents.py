@@ -18,6 +18,7 @@ from helpers.small_agents import (
 )
 from torchrl.envs.utils import set_exploration_type
 
+from baselines.parts.gates import GatedNetwork
 from baselines.parts.networks import Encoder
 from ctgraph_rl import Block, CTGraphEnv, Curriculum, Evaluation, learn_curriculum
 from ctgraph_rl.learn.collect import collect
@@ -121,18 +122,25 @@ def test_an_agent_reads_the_task_id_where_the_environment_shows_it(compose, name
     assert changed == [True, True, False]
 
 
-def test_an_encoder_reads_the_number_of_a_task_as_the_one_hot_vector_and_none_as_zeros():
+NETWORKS = {
+    "encoder": lambda num_ids, num_extra: Encoder(torch.Size([12]), 1.0, 8, num_extra=num_extra, num_ids=num_ids),
+    "gated": lambda num_ids, num_extra: GatedNetwork(torch.Size([12]), 1.0, num_ids, num_extra, 8, 2, 3, "soft", 4),
+}
+
+
+@pytest.mark.parametrize("make", NETWORKS.values(), ids=NETWORKS)
+def test_a_network_reads_the_number_of_a_task_as_the_one_hot_vector_and_none_as_zeros(make):
     torch.manual_seed(0)
-    by_number = Encoder(torch.Size([12]), 1.0, 8, num_extra=2, num_ids=5).double()
-    by_vector = Encoder(torch.Size([12]), 1.0, 8, num_extra=7).double()
+    by_number = make(5, 2).double()
+    by_vector = make(0, 7).double()
     by_vector.load_state_dict(by_number.state_dict())
     seen, extra = torch.rand(3, 6, 12, dtype=torch.float64), torch.rand(3, 6, 2, dtype=torch.float64)
-    number = torch.randint(-1, 5, (3, 6, 1))
+    number = torch.randint(5, (3, 6, 1))
+    number[1, 2] = -1
     vector = (number == torch.arange(5)).byte()
 
     ways = by_number(seen, number, extra), by_vector(seen, vector, extra)
 
-    assert (number == -1).any()
     by = torch.randn_like(ways[0])
     gradients = [
         torch.autograd.grad(way, list(net.parameters()), by)

@@ -8,7 +8,7 @@ from helpers.small_agents import REPLAY, agent_of, others_slow
 
 from baselines.parts import live_ids
 from baselines.parts.hooks import Hooks, PlasticityHooks
-from baselines.parts.networks import Encoder
+from baselines.parts.networks import IdLinear
 from ctgraph_rl import CTGraphEnv
 from ctgraph_rl.learn.collect import collect
 from curricula.paper import ct_su_b1
@@ -16,6 +16,8 @@ from curricula.paper import ct_su_b1
 ONE, TWO, HELD_OUT = ct_su_b1((1, 2)), ct_su_b1((2, 1)), ct_su_b1((1, 1))
 IDS = {ONE: 3, TWO: 17}
 NUM_IDS = 40
+
+TRIALS = ["agent.adapt_episodes=1", "agent.num_steps=12"]
 
 AGENTS = {
     "a2c": [],
@@ -26,6 +28,15 @@ AGENTS = {
     "dqn without moments": [*REPLAY, "agent.target_update_interval=4"],
     "drqn": [*REPLAY, "agent.replay_on_task_change=keep"],
     "mohqa": REPLAY,
+    "maml": ["agent.outer=ppo", *TRIALS, "agent.gate=soft"],
+    "cavia": ["agent.outer=ppo", *TRIALS],
+    "pearl without moments": [
+        "agent.gate=soft",
+        "agent.target_rate=1",
+        "agent.num_context=2",
+        "agent.context_size=8",
+        "agent.batch_size=8",
+    ],
 }
 
 
@@ -38,17 +49,17 @@ def learned(compose, name: str, widths: list[int], seen: list[tuple]) -> dict:
     rows = [[ONE] * 16, [TWO, HELD_OUT] * 8, [HELD_OUT] * 16]
     envs = [CTGraphEnv(tasks, seed=1, task_ids=IDS, num_task_ids=NUM_IDS) for tasks in rows]
     agent = agent_of(compose, name.split()[0], envs[0], "agent.max_grad_norm=1e9", *AGENTS[name])
-    encoder = next(module for module in agent.modules() if isinstance(module, Encoder))
+    layer = next(module for module in agent.modules() if isinstance(module, IdLinear) and module.num_ids)
     take_step = agent.gradient_step
 
     def gradient_step(minibatch):
-        widths.append(encoder.linear.weight.shape[1])
+        widths.append(layer.weight.shape[1])
         return take_step(minibatch)
 
     agent.gradient_step = gradient_step
     for number, env in enumerate(envs):
         agent.start_task(number)
-        if name == "dqn without moments":
+        if name.endswith("without moments"):
             agent.clear_optimiser_state(agent.trainable)
         for batch in collect(env, agent.policy, 3 * 16 * agent.num_steps, agent.num_steps, agent.initial_state):
             seen.append((number, agent.learn(batch)))
