@@ -85,7 +85,8 @@ class GatedNetwork(nn.Module):
         super().__init__()
         self.event_dims = len(shape)
         self.scale = 1 / high
-        self.layers = nn.ModuleList([GatedLayer(shape.numel(), hidden_size, gate, gate_size, num_ids, num_extra)])
+        first = GatedLayer(shape.numel(), hidden_size, gate, gate_size, num_ids=num_ids, num_extra=num_extra)
+        self.layers = nn.ModuleList([first])
         for _ in range(num_layers - 1):
             self.layers.append(GatedLayer(hidden_size, hidden_size, gate, gate_size))
         self.output = linear_layer(hidden_size, num_outputs)
