@@ -136,25 +136,21 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
                 (is_action, f"action must be an integer in 0..{self._num_actions - 1}, got {action!r}"),
                 (not self._is_over, "no episode is running: reset first"),
             )
-        if self._life is not None:
+        if self._life is None:
+            observation, ends = self.rows.act(_as_tensor(number))
+            self._is_over = bool(ends.item())
+            outcome, leaf = self.rows.result(ends) if self._is_over else (OUTCOME_RUNNING, NO_LEAF)
+        else:
             ended = self.rows.is_done
             if ended.item():
                 self._change_task()
-            seen = self.rows.step_or_reset(_as_tensor(number), ended)
+            observation, outcome, leaf, _ = self.rows.step_or_reset(_as_tensor(number), ended)
             self._age += 1
             self._is_over = self._age == self._life
-            info = {"task": self._number, "outcome": int(seen.outcome.item()), "leaf": int(seen.leaf.item())}
-            shown = add_id(seen.observation.numpy()[0], self._ids, self._number)
-            return shown, self.rows.reward.item(), False, self._is_over, info
-        observation, done = self.rows.act(_as_tensor(number))
-        self._is_over = bool(done.item())
-        outcome = OUTCOME_RUNNING
-        leaf = NO_LEAF
-        if self._is_over:
-            outcome, leaf = (int(value.item()) for value in self.rows.result(done))
+        info = {"task": self._number, "outcome": int(outcome), "leaf": int(leaf)}
         shown = add_id(observation.numpy()[0], self._ids, self._number)
-        info = {"task": self._number, "outcome": outcome, "leaf": leaf}
-        return shown, self.rows.reward.item(), self._is_over, False, info
+        is_cut = self._is_over and self._life is not None
+        return shown, self.rows.reward.item(), self._is_over and not is_cut, is_cut, info
 
     def _change_task(self) -> None:
         if self._next_number != self._number:
@@ -451,7 +447,7 @@ class StreamVectorEnv(CTGraphVectorEnv):
             logger.warn(
                 f"the stream of {self._frames:,} frames is over, its last task stays: reset(seed=) starts it again"
             )
-        if self.stream.is_end(self._frames) and self._frames < self.stream.num_frames:
+        elif self.stream.is_end(self._frames):
             self.set_tasks([self.stream.tasks[self.stream.block_at(self._frames)]] * self.num_envs)
 
     @override

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -42,47 +41,39 @@ def life_inputs(log: RunLog, stream: Stream) -> NamedValues:
     if done < needed or not needed:
         reason = Undefined(f"the run is not finished: it ended block {done:,} of {max(needed, 1):,}")
         return dict.fromkeys(INPUTS, reason)
-    return {**dict.fromkeys(INPUTS, NOT_OF_STREAMS), **life_of_blocks(log, stream, needed)}
-
-
-def life_of_blocks(log: RunLog, stream: Stream, count: int) -> NamedValues:
-    """Return the inputs of the first blocks of a life: its curves, and training by block in place of intervals."""
     frames = stream.blocks.num_frames
-    drawn = [stream.blocks.choice(place) for place in range(count)]
+    drawn = [stream.blocks.choice(place) for place in range(needed)]
 
     def by_block(value: Callable[[Task], float]) -> Tensor:
         return float64(list(map(value, stream.examples)))[drawn]
 
-    best = by_block(lambda task: optimal_value(task, 1.0))
-    zero = by_block(lambda task: task.fail_reward)
     step_reward = by_block(lambda task: task.step_reward)
-    episodes, total, steps = _training(log, count)
+    episodes, total, steps = _training(log, needed)
     paid = total + step_reward * (frames - steps)
     hides = stream.protocol.hides_episodes
     if hides:
         paid[step_reward != 0] = torch.nan  # steps between episodes pay nothing, and the log does not count them
-    first, *others = stream.examples
-    seen = _evaluations(log, stream, count)
+    first = stream.examples[0]
+    nothing = torch.full([needed], torch.nan, dtype=torch.float64, device="cpu")
+    moments = float64(list(range(0, frames + 1, stream.evaluation.every or frames)))
     curves = LifeCurves(
         frames,
-        seen.moments,
-        seen.returns,
-        success=seen.success,
-        untrained=seen.untrained,
-        lagged=seen.lagged,
-        best=best,
-        zero=zero,
+        moments,
+        returns=nothing.unsqueeze(1).repeat(1, len(moments)),
+        success=nothing.clone(),
+        best=by_block(lambda task: optimal_value(task, 1.0)),
+        zero=by_block(lambda task: task.fail_reward),
+        untrained=nothing.clone(),
+        lagged={lag: nothing.clone() for lag in LAGS},
         reward=paid,
         gain=by_block(lambda task: optimal_gain(task, pause=int(hides))),
-        alike=all(replace(task, goal=first.goal) == first for task in others),
+        alike=all(replace(task, goal=first.goal) == first for task in stream.examples[1:]),
     )
+    _fill(curves, log, [block[0] for block in stream.trained[: needed + 1]])
     noisy = not stream.evaluation.exact and any(task.reward_std for task in stream.examples)
-    return {
-        "life": NOISY if noisy else curves,
-        "episodes": episodes,
-        "returns": ratio(total, episodes),
-        "interval_best": best,
-    }
+    found = dict.fromkeys(INPUTS, NOT_OF_STREAMS)
+    found |= {"life": NOISY if noisy else curves, "interval_best": curves.best}
+    return found | {"episodes": episodes, "returns": ratio(total, episodes)}
 
 
 def _training(log: RunLog, count: int) -> Tensor:
@@ -99,43 +90,29 @@ def _training(log: RunLog, count: int) -> Tensor:
     return sums
 
 
-class _Seen(NamedTuple):
-    moments: Tensor
-    returns: Tensor
-    success: Tensor
-    untrained: Tensor
-    lagged: dict[int, Tensor]
-
-
-def _evaluations(log: RunLog, stream: Stream, count: int) -> _Seen:
-    frames = stream.blocks.num_frames
-    moments = range(0, frames + 1, stream.evaluation.every or frames)
-    nothing = torch.full([count], torch.nan, dtype=torch.float64, device="cpu")
-    returns = nothing.unsqueeze(1).repeat(1, len(moments))
-    success = nothing.clone()
-    untrained = nothing.clone()
-    lagged = {lag: nothing.clone() for lag in LAGS}
-    trained = [block[0] for block in stream.trained[: count + 1]]
+def _fill(curves: LifeCurves, log: RunLog, trained: Sequence[int]) -> None:
+    """Write what was evaluated into the curves; ``trained`` is each block's task, and that of the next block."""
+    count = len(curves.success)
+    last = len(curves.moments) - 1
     for m in log.of_kind("evaluation"):
         block = max(m["block"] - 1, 0)
         if block >= count:
             continue
         task = m["task"] - 1
         value = _number(m["return_mean"])
-        within = m["frames"] - block * frames
+        within = m["frames"] - block * curves.frames
         if task == trained[block]:
-            returns[block, moments.index(within)] = value
-        if within < frames:
+            curves.returns[block, within * last // curves.frames] = value
+        if within < curves.frames:
             continue
         if task == trained[block]:
-            success[block] = _number(m["success_rate"])
+            curves.success[block] = _number(m["success_rate"])
         if block + 1 < count and task == trained[block + 1]:
-            returns[block + 1, 0] = value
-            untrained[block + 1] = _number(m.get("untrained_return"))
-        for lag, values in lagged.items():
+            curves.returns[block + 1, 0] = value
+            curves.untrained[block + 1] = _number(m.get("untrained_return"))
+        for lag, values in curves.lagged.items():
             if block >= lag and task == trained[block - lag] and task not in trained[block - lag + 1 : block + 1]:
                 values[block] = value
-    return _Seen(float64(list(moments)), returns, success, untrained, lagged)
 
 
 def _number(value: float | None) -> float:
@@ -147,7 +124,6 @@ def by_windows(log: RunLog) -> RunLog:
 
     Evaluations are means over a window's tasks at their blocks' ends, training those of up to `PARTS` parts.
     """
-    about = log.of_kind("run")[0]
     ends: dict[int, NamedValues] = {}
     for m in log.of_kind("evaluation"):
         if m.get("moment") != "during":
@@ -155,10 +131,12 @@ def by_windows(log: RunLog) -> RunLog:
     training: dict[int, list[NamedValues]] = {}
     for m in log.of_kind("training"):
         training.setdefault(m["block"], []).append(m)
+    about = log.of_kind("run")[0]
+    count = about["life"] if tuning_share(about) is None else max(ends, default=0)
     labels = []
     lines = [{**ends[0], "label": ""}] if 0 in ends else []
-    blocks = torch.arange(1, about["life"] + 1, device="cpu")
-    for number, window in enumerate(blocks.tensor_split(min(NUM_WINDOWS, about["life"])), 1):
+    blocks = torch.arange(1, max(count, 1) + 1, device="cpu")
+    for number, window in enumerate(blocks.tensor_split(min(NUM_WINDOWS, len(blocks))), 1):
         first, last = window[0].item(), window[-1].item()
         labels.append(f"tasks {first:,}-{last:,}" if last > first else f"task {first:,}")
         for part in window.tensor_split(min(PARTS, len(window))):

@@ -68,12 +68,17 @@ class LifeCurves:
         return ratio(self.returns - self.zero.unsqueeze(1), (self.best - self.zero).unsqueeze(1))
 
     @property
+    def solved(self) -> Tensor:
+        """1 where the task is adapted to, else 0; NaN where not evaluated; float64 [N, M + 1]."""
+        progress = self.progress
+        return torch.where(progress.isnan(), torch.nan, (progress >= MASTERED - 1e-9).double())
+
+    @property
     def adapted(self) -> Tensor:
         """The frames of each block until its task is adapted to, at most all of them; float64 [N], NaN if unknown."""
-        reached = self.progress >= MASTERED - 1e-9
-        first = reached.double().argmax(1)
-        frames = torch.where(reached.any(1), self.moments[first], float(self.frames))
-        return torch.where(self.returns.isnan().any(1), torch.nan, frames)
+        most, first = self.solved.max(1)
+        frames = torch.where(most == 1, self.moments[first], float(self.frames))
+        return torch.where(most.isnan(), torch.nan, frames)
 
 
 def window_means(values: Tensor) -> Tensor:
@@ -130,8 +135,7 @@ def window_regret(life: LifeCurves) -> Tensor:
 )
 def window_solved(life: LifeCurves) -> Tensor:
     """Share of the last window's tasks that are adapted to at the end of their blocks."""
-    at_end = life.progress[:, -1]
-    return window_means(torch.where(at_end.isnan(), torch.nan, (at_end >= MASTERED - 1e-9).double()))
+    return window_means(life.solved[:, -1])
 
 
 @defined(
@@ -164,8 +168,7 @@ def adaptation_frames(life: LifeCurves) -> Tensor:
 )
 def never_adapted(life: LifeCurves) -> Tensor:
     """Share of tasks that are not adapted to at any evaluation in their block."""
-    reached = (life.progress >= MASTERED - 1e-9).any(1)
-    return window_means(torch.where(life.returns.isnan().any(1), torch.nan, 1 - reached.double()))
+    return window_means(1 - life.solved.amax(1))
 
 
 @of_windows(
@@ -181,11 +184,9 @@ def adaptation_area(life: LifeCurves) -> Tensor:
 def _retention(life: LifeCurves, lag: int) -> Tensor:
     if len(life.success) <= lag:
         raise Undefined(f"the life has {len(life.success)} blocks, and none is {lag} blocks after another")
-    start = torch.full([lag], torch.nan, dtype=torch.float64, device="cpu")
-    own = torch.cat([start, life.progress[:-lag, -1]])
-    scale = torch.cat([start, (life.best - life.zero)[:-lag]])
-    kept = ratio(life.lagged[lag] - torch.cat([start, life.zero[:-lag]]), scale)
-    own = torch.where(kept.isnan(), torch.nan, own)
+    before = life.progress[:, -1].roll(lag)
+    kept = ratio(life.lagged[lag] - life.zero.roll(lag), (life.best - life.zero).roll(lag))
+    own = torch.where(kept.isnan(), torch.nan, before)
     sums = torch.stack([part.nanmean() * part.isfinite().sum() for part in _windows(kept)])
     return ratio(sums, own.nansum())
 

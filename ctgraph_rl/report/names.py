@@ -48,7 +48,7 @@ def modification(run: Run) -> str:
 def _collect(value: Any, key: str, found: dict[str, list[Any]]) -> None:
     if isinstance(value, Mapping):
         for name, inner in value.items():
-            if key or name not in NOT_COMPARED:
+            if name != "run_seed" and (key or name not in NOT_COMPARED):
                 _collect(inner, f"{key}.{name}".lstrip("."), found)
     elif isinstance(value, list) and any(isinstance(inner, (Mapping, list)) for inner in value):
         for inner in value:

@@ -328,7 +328,7 @@ class Stream(Curriculum):
         return _DrawnIds(self)
 
     @property
-    def labels(self) -> Lazy[str]:
+    def labels(self) -> Lazy:
         """A short name for each of ``tasks``: its number and goal."""
         return Lazy(len(self.blocks), self.blocks.label)
 
@@ -340,7 +340,7 @@ class Stream(Curriculum):
         return self._labels_of(self.examples)
 
     @property
-    def trained(self) -> Lazy[tuple[int, ...]]:
+    def trained(self) -> Lazy:
         """For each block, the position of its task in ``tasks``."""
         return Lazy(len(self.blocks), self._trained)
 

@@ -7,14 +7,13 @@ from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, TypeVar, overload
+from itertools import product
+from typing import Any
 
-from ctgraph_rl.checks import MOST_STREAMED, are_ints, is_int, is_real, make_fields_plain, one_of, require
+from ctgraph_rl.checks import MOST_STREAMED, are_ints, at_least_one, is_int, is_real, make_fields_plain, one_of, require
 from ctgraph_rl.core.goal import write_goal
 from ctgraph_rl.tasks.protocol import Block
 from ctgraph_rl.tasks.task import Task
-
-Made = TypeVar("Made")
 
 ORDERS = ("similar", "dissimilar", "returning", "drifting", "conflicting")
 
@@ -23,21 +22,17 @@ IMAGE_SEEDS = 2**40
 KEPT = 256
 
 
-class Lazy(Sequence[Made]):
+class Lazy(Sequence[Any]):
     """Items that are made when asked for; slices are tuples."""
 
-    def __init__(self, count: int, make: Callable[[int], Made]) -> None:
+    def __init__(self, count: int, make: Callable[[int], Any]) -> None:
         self._count = count
         self._make = make
 
     def __len__(self) -> int:
         return self._count
 
-    @overload
-    def __getitem__(self, place: int) -> Made: ...
-    @overload
-    def __getitem__(self, place: slice) -> tuple[Made, ...]: ...
-    def __getitem__(self, place: int | slice) -> Made | tuple[Made, ...]:
+    def __getitem__(self, place: Any) -> Any:
         if isinstance(place, slice):
             return tuple(self[i] for i in range(*place.indices(len(self))))
         if not -len(self) <= place < len(self):
@@ -45,7 +40,7 @@ class Lazy(Sequence[Made]):
         return self._make(place % len(self))
 
 
-class DrawnTasks(Lazy[Task]):
+class DrawnTasks(Lazy):
     """The tasks of a stream; the last `KEPT` that were asked for are kept.
 
     Args:
@@ -111,17 +106,14 @@ class Life(Sequence[Block]):
         are_choices = bool(self.choices) and all(isinstance(task, Task) for task in self.choices)
         images = self.image_seeds
         are_sets = are_ints(images, 0, 2**63 - 1) and len(set(images)) == len(images)
+        most = f"num_tasks must be in 1..{MOST_STREAMED:,}, got {self.num_tasks!r}"
         require(
             (are_choices, f"a stream draws from at least one Task, got {self.choices!r:.80}"),
-            (
-                is_int(self.num_tasks, 1, MOST_STREAMED),
-                f"num_tasks must be in 1..{MOST_STREAMED:,}, got {self.num_tasks!r}",
-            ),
-            (is_int(self.num_frames, 1), f"num_frames must be an integer >= 1, got {self.num_frames!r}"),
+            (is_int(self.num_tasks, 1, MOST_STREAMED), most),
+            *at_least_one(num_frames=self.num_frames, lag=self.lag),
             *one_of(ORDERS, order=self.order),
             (are_sets, f"image_seeds must be different integers in [0, 2**63), got {images!r:.80}"),
             (is_share, f"share must be in (0, 1], got {self.share!r}"),
-            (is_int(self.lag, 1), f"lag must be an integer >= 1, got {self.lag!r}"),
             (is_seed, f"seed must be an integer in [0, 2**63) or null, got {self.seed!r}"),
             (is_int(self.run_seed, 0, 2**63 - 1), f"run_seed must be in [0, 2**63), got {self.run_seed!r}"),
         )
@@ -129,47 +121,37 @@ class Life(Sequence[Block]):
         several = len(self.choices) > 1
         returns = f"lag={self.lag} must be less than num_tasks={self.num_tasks}, else no task returns"
         one_set = self.order in ("similar", "conflicting")
-        drifts = not several or all(self._neighbours.values())
+        drifts = self.order == "drifting" and several
         fix = "needs goals that differ in one decision: give goals=all, or one goal"
         every = "needs goals that differ in every decision: give goals=all, or two goals such as [1.1,2.2]"
         require(
             (one_set or many_images, f"order={self.order} needs several generated image sets"),
             (self.order != "similar" or several, "order=similar needs tasks that differ in more than their images"),
             (self.order != "returning" or self.lag < self.num_tasks, returns),
-            (self.order != "drifting" or drifts, f"order=drifting {fix}"),
-            (self.order != "conflicting" or all(self._opposites.values()), f"order=conflicting {every}"),
+            (not drifts or all(self.followers), f"order=drifting {fix}"),
+            (self.order != "conflicting" or all(self.followers), f"order=conflicting {every}"),
         )
 
     @cached_property
-    def _neighbours(self) -> dict[int, list[int]]:
+    def followers(self) -> list[list[int]]:
+        """For each choice those with another goal: in one decision, or in all where tasks are conflicting."""
         places = {task: place for place, task in enumerate(self.choices)}
-        found: dict[int, list[int]] = {}
-        for task, place in places.items():
-            found[place] = []
-            for level, own in enumerate(task.goal):
-                for branch in range(1, task.graph.branching_factor + 1):
-                    goal = (*task.goal[:level], branch, *task.goal[level + 1 :])
-                    other = places.get(replace(task, goal=goal))
-                    if branch != own and other is not None:
-                        found[place].append(other)
-        return found
-
-    @cached_property
-    def _opposites(self) -> dict[int, list[int]]:
-        found: dict[int, list[int]] = {}
-        for place, task in enumerate(self.choices):
-            found[place] = []
-            for other, another in enumerate(self.choices):
-                disagree = all(own != its for own, its in zip(task.goal, another.goal, strict=False))
-                if disagree and replace(another, goal=task.goal) == task:
-                    found[place].append(other)
+        found = []
+        for task in self.choices:
+            branches = range(1, task.graph.branching_factor + 1)
+            turns = [[branch for branch in branches if branch != own] for own in task.goal]
+            goals = [*product(*turns)]
+            if self.order == "drifting":
+                goals = []
+                for level, others in enumerate(turns):
+                    goals += [(*task.goal[:level], branch, *task.goal[level + 1 :]) for branch in others]
+            changed = [places.get(replace(task, goal=goal)) for goal in goals]
+            found.append([place for place in changed if place is not None])
         return found
 
     @cached_property
     def _draws(self) -> _Draws:
-        if self.order == "drifting":
-            return _Draws(self, self._neighbours)
-        return _Draws(self, self._opposites if self.order == "conflicting" else {})
+        return _Draws(self)
 
     @cached_property
     def tasks(self) -> DrawnTasks:
@@ -208,9 +190,8 @@ class Life(Sequence[Block]):
 class _Draws:
     """The draws up to the last block that was asked for, 16 bytes each."""
 
-    def __init__(self, life: Life, neighbours: dict[int, list[int]]) -> None:
+    def __init__(self, life: Life) -> None:
         self.life = life
-        self.neighbours = neighbours
         self._source = random.Random(life.run_seed if life.seed is None else life.seed)
         self._choices = array("I")
         self._images = array("Q")
@@ -238,16 +219,16 @@ class _Draws:
             choice = self._below(len(life.choices))
             image = self._new_image()
         else:
-            last = self._choices[-1]
-            others = self.neighbours.get(last, ())
-            choice = last
+            choice = self._choices[-1]
             image = self._images[-1]
             if life.order == "similar":
-                choice = (last + 1 + self._below(len(life.choices) - 1)) % len(life.choices)
-            elif life.order == "conflicting" or (others and self._below(len(life.choices[last].goal) + 1)):
-                choice = others[self._below(len(others))]
+                choice = (choice + 1 + self._below(len(life.choices) - 1)) % len(life.choices)
             else:
-                image = self._new_image()
+                others = life.followers[choice]
+                if life.order == "conflicting" or (others and self._below(len(life.choices[choice].goal) + 1)):
+                    choice = others[self._below(len(others))]
+                else:
+                    image = self._new_image()
         self._choices.append(choice)
         self._images.append(image)
         self._origins.append(origin)

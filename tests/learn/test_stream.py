@@ -26,6 +26,7 @@ from baselines.methods.scratch import Scratch
 from ctgraph_rl import Recorder, RunLog, learn_curriculum
 from ctgraph_rl.learn.refusals import notes
 from ctgraph_rl.learn.stacked import why_not_together
+from ctgraph_rl.log.life_curves import by_windows
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.report.terminal import print_summary
 from ctgraph_rl.runs.config import composed
@@ -277,6 +278,19 @@ def test_tables_of_a_life_have_windows_in_place_of_tasks(run_of_twelve):
     assert "adaptation frames: at least; 100% of tasks never reach 0.9" in printed
 
 
+def test_windows_of_a_tuning_run_are_of_the_blocks_that_it_learned(run_of_twelve):
+    whole = RunLog.read(run_of_twelve.path / "run.jsonl")
+    tuning = RunLog()
+    tuning.measurements = [m for m in whole.measurements if m.get("block", 0) <= 3]
+    about = tuning.measurements[0]
+    tuning.measurements[0] = {**about, "config": {**about["config"], "objective_until": 0.25}}
+
+    found = by_windows(tuning)
+
+    assert found.labels(3) == ("task 1", "task 2", "task 3")
+    assert found.ends() == [0, 64, 128, 192]
+
+
 def test_figures_of_a_life_have_the_lines_of_policies_that_do_not_learn(run_of_twelve):
     pytest.importorskip("matplotlib")
     from ctgraph_rl.report.figures.heatmaps import transfer_maps
@@ -286,8 +300,11 @@ def test_figures_of_a_life_have_the_lines_of_policies_that_do_not_learn(run_of_t
     [section] = sections([run_of_twelve])
 
     returns, _, lost, _ = life_windows(section).figure.axes
+    tasks, mean_returns = returns.lines[1].get_data()
 
     reached = reached_by_policies(stream().tasks[0], 64)
+    assert tasks.tolist() == [2, 4, 5, 6, 7, 8, 9, 10, 11, 12]
+    assert mean_returns.tolist() == run_of_twelve.windows("window_return")
     grey = [{round(line.get_ydata()[0], 9) for line in axes.lines[2:]} for axes in (returns, lost)]
     assert grey[0] == {round(each.at_end, 9) for each in reached.values()}
     assert grey[1] == {round(each.in_frames / 64, 9) for each in reached.values()}

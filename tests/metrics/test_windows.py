@@ -56,6 +56,19 @@ def test_a_life_of_three_tasks(name, terms, value):
     assert metric.value == pytest.approx(value)
 
 
+def test_retention_is_measured_from_each_tasks_failure():
+    failures = float64([1.0, -2.0, 4.0])
+    moved = replace(
+        THREE,
+        returns=THREE.returns + failures.unsqueeze(1),
+        best=THREE.best + failures,
+        zero=failures,
+        lagged={1: THREE.lagged[1] + failures.roll(1)},
+    )
+
+    assert metrics.retention_1(moved).terms == pytest.approx(metrics.retention_1(THREE).terms, nan_ok=True)
+
+
 def test_learnability_is_over_the_first_tasks_frames_and_needs_equal_difficulty():
     quick = replace(THREE, returns=float64([[0.0, 0.95, 0.95], [0.2, 1.8, 1.0], [0.5, 0.5, 0.25]]))
 

@@ -41,6 +41,18 @@ def agents_of(runs) -> list[str]:
     return [agent for _, agent in grouped(runs)]
 
 
+def test_the_runs_seed_that_draws_a_stream_is_no_modification(tmp_path):
+    life = curricula.load("stream", num_tasks=5, num_frames=64).for_seed(3)
+    run = run_of(tmp_path / "run", life, seed=3)
+
+    said = modifications(find_runs([run])[0])
+
+    changes = (
+        "blocks.num_tasks=5 instead of 100, blocks.num_frames=64 instead of 24576, evaluation.every=8 instead of 3072"
+    )
+    assert said == {"stream (modified)": changes}
+
+
 def test_a_modified_curriculum_says_what_was_modified_in_every_output(tmp_path):
     changed = replace(curricula.load("su_b1_4tasks", num_frames=8192), evaluation=Evaluation(every=2048))
     run = run_of(tmp_path / "run", replace(changed, protocol=Protocol("one_hot")))

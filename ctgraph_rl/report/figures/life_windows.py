@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from statistics import fmean
 from typing import Any
 
@@ -12,6 +13,7 @@ from ctgraph_rl.report.figures.gallery import CaptionedFigure, left_out
 from ctgraph_rl.report.figures.learning_curves import named
 from ctgraph_rl.report.sections import Section
 from ctgraph_rl.report.style import MOST_AGENTS, agent_style, agents_legend, panels
+from ctgraph_rl.runs.read import histories
 from ctgraph_rl.tasks.curriculum import LAGS, Stream
 from ctgraph_rl.tasks.gain import reached_by_policies
 
@@ -31,6 +33,7 @@ def life_windows(section: Section) -> CaptionedFigure | None:
     if not section.finished or "life" not in section.one.about:
         return None
     shown = section.results[:MOST_AGENTS]
+    frames = section.one.about["num_frames"] / section.one.about["life"]
     policies = _reached(curriculum_of(section.one))
     caption = (
         "Means over windows of successive tasks; retention is the share of a task's return, from failure to optimum, "
@@ -42,14 +45,15 @@ def life_windows(section: Section) -> CaptionedFigure | None:
     *of_windows, last = grid.ravel()[: len(PANELS) + 1]
     for axes, (metric, title) in zip(of_windows, PANELS.items(), strict=True):
         for position, result in enumerate(shown):
+            ends = next((history.ends for history in histories(result.finished)), ())
             rows = [run.windows(metric) for run in result.finished]
             if metric == "frame_regret":
-                rows = [_per_frame(row, section) for row in rows]
-            _draw(axes, range(1, len(section.labels) + 1), rows, agent_style(position, result.agent))
+                rows = [np.divide(row, np.diff(ends)) for row in rows]
+            _draw(axes, np.divide(ends[1:], frames), rows, agent_style(position, result.agent))
         for name, values in policies.items():
             if metric in values:
                 axes.axhline(values[metric], zorder=0, **GREY, linestyle=LINES[name])
-        axes.set(xlabel=f"window of {section.one.about['life'] // len(section.labels):,} tasks", ylabel=title)
+        axes.set(xlabel="tasks so far", ylabel=title)
     of_windows[1].set_ylim(-0.05, 1.05)
     for position, result in enumerate(shown):
         rows = [[_value(run, f"retention_{lag}") for lag in LAGS] for run in result.finished]
@@ -64,23 +68,17 @@ def life_windows(section: Section) -> CaptionedFigure | None:
 
 
 def _reached(stream: Any) -> dict[str, dict[str, float]]:
+    found: dict[str, dict[str, float]] = {}
     if not isinstance(stream, Stream):
-        return {}
+        return found
     frames = stream.blocks.num_frames
-    pause = int(stream.protocol.hides_episodes)
-    of_tasks = [reached_by_policies(task, frames, pause) for task in stream.examples]
-    found = {}
+    of_tasks = [reached_by_policies(task, frames, int(stream.protocol.hides_episodes)) for task in stream.examples]
     for name in LINES:
-        known = [each[name] for each in of_tasks if name in each]
-        if len(known) == len(of_tasks):
-            per_frame = fmean(each.in_frames for each in known) / frames
-            found[name] = {"window_return": fmean(each.at_end for each in known), "frame_regret": per_frame}
+        if all(name in reached for reached in of_tasks):
+            at_end = fmean(reached[name].at_end for reached in of_tasks)
+            lost = fmean(reached[name].in_frames for reached in of_tasks)
+            found[name] = {"window_return": at_end, "frame_regret": lost / frames}
     return found
-
-
-def _per_frame(row: list[float], section: Section) -> list[float]:
-    lengths = np.diff(section.ends)
-    return [lost / frames for lost, frames in zip(row, lengths, strict=False)]
 
 
 def _value(run: Any, metric: str) -> float:
@@ -88,7 +86,7 @@ def _value(run: Any, metric: str) -> float:
     return float("nan") if value is None else value
 
 
-def _draw(axes: Any, places: Any, rows: list[list[float]], look: dict[str, Any]) -> None:
+def _draw(axes: Any, places: Any, rows: Sequence[Any], look: dict[str, Any]) -> None:
     if rows:
         for row in rows:
             axes.plot(places, row, color=look["color"], linestyle="", marker=".", markersize=2)
