@@ -8,7 +8,8 @@ it reaches the goal in 90 of 100 greedy episodes, JAX's in 0.9 of a batch's, who
 those of one core. --cells measures only LSTM-PPO, with each cell in place of the LSTM. Ctrl-C ends a measurement, and
 prints what was measured until then.
 
---device cuda measures benchmarks.agent_ladder instead.
+--device cuda measures PPO and LSTM-PPO there instead, as they learn in a run: step by step, captured, and PPO compiled.
+Many seeds learn as one job, with stacked weights. The yardstick is the environment with given actions.
 """
 
 from __future__ import annotations
@@ -16,31 +17,39 @@ from __future__ import annotations
 import argparse
 import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
 from importlib.util import find_spec
-from typing import Any, Protocol
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
+import yaml
 from rich.console import Console
 from rich.progress import track
 
 from baselines.parts.catalogue import catalogue
-from benchmarks import agent_ladder
+from baselines.parts.policy_gradient import PolicyGradient
+from baselines.update.captured import CapturedGroup
 from benchmarks import environment_ladder as ladder
+from benchmarks.environment_ladder import Rung, TimedRun
 from ctgraph_rl import CTGraphEnv, Task, evaluate
+from ctgraph_rl.batch.specs import make_specs
 from ctgraph_rl.checks import NamedValues, at_least_one, require
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.learn.collect import collect
 from ctgraph_rl.log.escape import markdown_table
+from ctgraph_rl.packages import class_named, conf_dir
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_su_b1
 
+CPU = torch.device("cpu")
 ROWS = 256
 GOAL = (1, 2)
 SOLVED = 0.9
 CHUNK = 8192
+ENDLESS = 10**6
 
 TASKS = {"CT-FO-B1": ct_fo_b1(GOAL), "CT-SU-B1": ct_su_b1(GOAL), "CT-CO-B1": ct_co_b1(GOAL)}
 PAIRS = (
@@ -52,85 +61,80 @@ PAIRS = (
 )
 IN_JAX = (("ppo", "CT-FO-B1"), ("lstm_ppo", "CT-SU-B1"))
 
+ENVIRONMENT = "environment only"
+ON_DEVICE = {"ppo": "CT-FO-B1", "ppo_published": "CT-FO-B1", "lstm_ppo": "CT-SU-B1"}
 
-class Learning(Protocol):
-    """An agent with its environments."""
+GOALS = {"ppo": 10e6, "lstm_ppo": 1e6}
+"""Environment steps a second for one agent to learn from."""
 
-    def learn(self) -> int:
-        """Learn for a while; return the frames."""
-        ...
+MAIN_JOB = 4 * 204_800
 
-    def success(self) -> float:
-        """Return the share of greedy episodes that reach the goal."""
-        ...
-
-
-@dataclass
-class Contender:
-    """A learner and its measurements."""
-
-    agent: str
-    task: str
-    who: str
-    make: Callable[[int], Learning]  # of a seed
-    speeds: list[float] = field(default_factory=list)
-    solved: list[tuple[int, float] | None] = field(default_factory=list)
-
-    def measure(self, learning: Learning, seconds: float) -> None:
-        """Measure frames per second over so many seconds."""
-        frames = 0
-        start = time.process_time()
-        while time.process_time() - start < seconds:
-            frames += learning.learn()
-        self.speeds.append(frames / (time.process_time() - start))
-
-    def solve(self, seed: int, max_frames: int) -> None:
-        """Learn until the task is solved; note frames and seconds, or None after ``max_frames``."""
-        learning = self.make(seed)
-        frames = 0
-        seconds = 0.0
-        checked = 0
-        while frames < max_frames:
-            start = time.process_time()
-            frames += learning.learn()
-            seconds += time.process_time() - start
-            if frames - checked >= CHUNK:
-                checked = frames
-                if learning.success() >= SOLVED:
-                    self.solved.append((frames, seconds))
-                    return
-        self.solved.append(None)
+SEEDS_GOAL = 1024 * MAIN_JOB / (15 * 60)
+"""Environment steps a second for 1,024 seeds of the main job in 15 minutes."""
 
 
-def cell_named(name: str) -> partial[Any]:
-    """Return what builds a cell with its file's settings."""
-    entry = next(entry for entry in catalogue("cell") if entry.name == name)
-    return partial(entry.kind, **entry.settings)
+class Contender(NamedTuple):
+    """A learner: its speed, and what makes it for a seed.
+
+    It has ``learn``, which returns the frames that it learned from, and ``success``, a share of greedy episodes.
+    """
+
+    rung: Rung
+    make: Callable[[int], Any]
 
 
 def settings(name: str) -> NamedValues:
-    """Return hyperparameters for `ROWS` rows, with the yaml file's frames per batch."""
-    given = agent_ladder.settings(name)
+    """Return an agent's yaml file with those that it starts from."""
+    own = yaml.safe_load(Path(conf_dir(), "agent", f"{name}.yaml").read_text(encoding="utf-8"))
+    found: NamedValues = {}
+    for other in own.pop("defaults", []):
+        if other != "_self_":
+            found |= settings(other)
+    return found | own
+
+
+def on_256_rows(name: str) -> NamedValues:
+    """Return an agent's hyperparameters for `ROWS` rows, with the yaml file's frames per batch."""
+    given = settings(name)
     frames = given["num_envs"] * given["num_steps"]
     return {**given, "num_envs": ROWS, "num_steps": max(1, frames // ROWS)}
 
 
+def built(values: NamedValues, task: Task) -> PolicyGradient:
+    """Return an agent with these settings, on the CPU."""
+    values = dict(values)
+    module, _, of_class = values.pop("_target_").rpartition(".")
+    kind: Any = class_named(module, of_class)
+    return kind(*make_specs([task]), **values)
+
+
 class Ours:
-    """An agent of this package.
+    """An agent of this package that learns from a batch.
 
     Args:
-        cell: a file of ``conf/cell``; None: the agent's.
+        values: its settings.
+        captured: whether a GPU replays its steps.
+        env: settings of the environment.
     """
 
-    def __init__(self, name: str, task: Task, seed: int, cell: str | None = None) -> None:
-        changes = settings(name) | ({} if cell is None else {"cell": cell_named(cell)})
+    def __init__(
+        self,
+        values: NamedValues,
+        task: Task,
+        seed: int,
+        device: torch.device = CPU,
+        captured: bool = True,
+        **env: bool,
+    ) -> None:
         torch.manual_seed(seed)
-        env = CTGraphEnv([task] * ROWS, seed)
+        rows = CTGraphEnv([task] * values["num_envs"], seed, device=device, **env)
         self.task = task
-        self.agent = agent = agent_ladder.built(name, task, **changes)
-        batch = agent.num_envs * agent.num_steps
+        self.agent = agent = built(values, task).to(device)
+        if not captured:
+            agent.capturable = agent.policy.capturable = False  # type: ignore[misc]
         agent.start_task()
-        self.batches = collect(env, agent.policy, 10**6 * batch, agent.num_steps, agent.initial_state)
+        frames = ENDLESS * agent.num_envs * agent.num_steps
+        self.batches = collect(rows, agent.policy, frames, agent.num_steps, agent.initial_state)
 
     def learn(self) -> int:
         """Learn from one batch."""
@@ -150,60 +154,116 @@ def contenders(agents: list[str]) -> Iterator[Contender]:
         if name not in agents:
             continue
         task = TASKS[label]
-        yield Contender(name, label, "ours", partial(Ours, name, task))
+        values = on_256_rows(name)
+        yield contender(f"{name} on {label}", "ours", partial(Ours, values, task))
         if find_spec("sb3_contrib"):
             from benchmarks import stable  # needs Stable-Baselines3, which is optional
 
             for who, way in stable.ways().items():
-                yield Contender(name, label, who, partial(stable.Stable, name, settings(name), task, way))
+                yield contender(f"{name} on {label}", who, partial(stable.Stable, name, values, task, way))
         if find_spec("jax") and (name, label) in IN_JAX:
             from benchmarks import jax_ppo  # needs JAX, which is optional
 
-            yield Contender(name, label, "JAX", partial(jax_ppo.JAX, name, settings(name), task))
+            yield contender(f"{name} on {label}", "JAX", partial(jax_ppo.JAX, name, values, task))
 
 
 def cells(names: list[str]) -> Iterator[Contender]:
     """Yield LSTM-PPO with each cell, on the task that needs memory and has fewest images."""
-    for name in names:
-        make = partial(Ours, "lstm_ppo", TASKS["CT-SU-B1"], cell=name)
-        yield Contender(f"lstm_ppo cell={name}", "CT-SU-B1", "ours", make)
+    for entry in catalogue("cell"):
+        if entry.name in names:
+            values = {**on_256_rows("lstm_ppo"), "cell": partial(entry.kind, **entry.settings)}
+            yield contender(f"lstm_ppo cell={entry.name}", "ours", partial(Ours, values, TASKS["CT-SU-B1"]))
 
 
-def table(measured: list[Contender]) -> str:
-    """Format medians in Markdown, with the speed relative to ours."""
-    ours = {
-        (one.agent, one.task): statistics.median(one.speeds) for one in measured if one.who == "ours" and one.speeds
-    }
-    measured = [one for one in measured if one.speeds and (one.agent, one.task) in ours]
-    rows = []
-    for one in measured:
-        speed = statistics.median(one.speeds)
-        ratio = "" if one.who == "ours" else f"{ours[one.agent, one.task] / speed:.1f} x"
-        rows.append([one.agent, one.task, one.who, f"{speed:,.0f}", ratio, *_solved(one.solved)])
-    head = ("agent", "task", "who", "frames/s", "ours is", "frames to 90 %", "seconds to 90 %")
-    return markdown_table(head, rows)
+def contender(agent: str, who: str, make: Callable[[int], Any]) -> Contender:
+    """Return a contender whose speed is that of one learner over all rounds."""
+    return Contender(Rung(who, agent, ROWS, cache(lambda: make(0).learn)), make)
 
 
-def _solved(found: list[tuple[int, float] | None]) -> tuple[str, str]:
+def solve(learner: Any, max_frames: int) -> tuple[int, float] | None:
+    """Let a learner solve its task; return frames and seconds, or None after ``max_frames``."""
+    frames = 0
+    seconds = 0.0
+    checked = 0
+    while frames < max_frames:
+        start = time.process_time()
+        frames += learner.learn()
+        seconds += time.process_time() - start
+        if frames - checked >= CHUNK:
+            checked = frames
+            if learner.success() >= SOLVED:
+                return frames, seconds
+    return None
+
+
+def times_to_solve(measured: Sequence[Contender], options: ladder.Options) -> str:
+    """Let all solve their tasks, or until Ctrl-C; return a table of median frames and seconds."""
+    found: list[list[tuple[int, float] | None]] = [[] for _ in measured]
+    work = list(product(range(options.seeds), zip(measured, found, strict=True)))
+    with suppress(KeyboardInterrupt):
+        for seed, (one, times) in track(work, "learning", console=Console(stderr=True)):
+            times.append(solve(one.make(seed), options.max_frames))
+    rows = [[one.rung.task, one.rung.name, *medians(times)] for one, times in zip(measured, found, strict=True)]
+    return markdown_table(("agent", "who", "frames to 90 %", "seconds to 90 %"), rows)
+
+
+def medians(found: list[tuple[int, float] | None]) -> tuple[str, str]:
+    """Return median frames and seconds, or how many seeds solved the task if these are not most."""
     times = sorted(one for one in found if one is not None)
     if len(times) * 2 <= len(found):
-        return (f"{len(times)} of {len(found)} seeds", "") if found else ("", "")
+        return f"{len(times)} of {len(found)} seeds", ""
     frames, seconds = (statistics.median(values) for values in zip(*times, strict=True))
     return f"{frames:,.0f}", f"{seconds:.2f}"
 
 
-def on_device(device: torch.device, options: ladder.Options) -> str:
-    """Measure `benchmarks.agent_ladder`; return its table."""
-    rungs = []
-    for rung in agent_ladder.rungs(device, options.rows, options.together):
-        if rung.name == agent_ladder.ENVIRONMENT or rung.name.partition(",")[0] in options.agents:
-            rungs.append(rung)
-    ladder.climb(rungs, options, device)
-    return ladder.report(rungs, options, device, agent_ladder.ENVIRONMENT)
+def rungs(device: torch.device, num_rows: Sequence[int], num_seeds: Sequence[int]) -> Iterator[Rung]:
+    """Yield what is measured on a device, in the order of the table.
+
+    Args:
+        num_rows: environments of one agent, of those with a goal.
+        num_seeds: agents of one job, each with its yaml file's environments.
+    """
+    for name, label in ON_DEVICE.items():
+        task = TASKS[label]
+        values = settings(name)
+        learner = partial(Ours, task=task, seed=0, device=device, check_actions=False, info=False)
+        for n in num_rows if name in GOALS else ():
+            yield Rung(ENVIRONMENT, label, n, partial(ladder.WAYS["rollout, captured"], [task] * n, device))
+            given = {**values, "num_envs": n}
+            ways = {"step by step": partial(learner, given, captured=False), "captured": partial(learner, given)}
+            if name == "ppo":
+                ways["compiled and captured"] = partial(learner, {**given, "compile": True})
+            for way, make in ways.items():
+                yield Rung(f"{name}, {way}", label, n, lambda make=make: make().learn, GOALS[name])
+        for count in num_seeds:
+            goal = SEEDS_GOAL if name == "lstm_ppo" else 0.0
+            together = partial(seeds, values, task, count, device)
+            yield Rung(f"{name}, {count:,} seeds as one job", label, count * values["num_envs"], together, goal)
+
+
+def seeds(values: NamedValues, task: Task, num_seeds: int, device: torch.device) -> TimedRun:
+    """Return a run of many seeds, as of ``together=true``, each learning from its batch."""
+    agents = [built(values, task).to(device) for _ in range(num_seeds)]
+    generators = [torch.Generator(device="cpu").manual_seed(seed) for seed in range(num_seeds)]
+    group = CapturedGroup(agents, generators)
+    num_envs = agents[0].num_envs
+    num_steps = agents[0].num_steps
+    env = CTGraphEnv([task] * num_seeds * num_envs, device=device, check_actions=False, info=False)
+    row = torch.arange(num_seeds * num_envs, device=device)
+    env.rows.set_streams(row // num_envs, row % num_envs)
+    frames = ENDLESS * env.numel() * num_steps
+    collected = collect(env, group.policy, frames, num_steps, agents[0].initial_state)
+
+    def run() -> int:
+        batch = next(collected)
+        group.learn(batch)
+        return batch.numel()
+
+    return run
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Measure and print the table."""
+    """Measure and print the tables."""
     names = list(dict.fromkeys(name for name, _ in PAIRS))
     known = [entry.name for entry in catalogue("cell")]
     parser = argparse.ArgumentParser(prog="python -m benchmarks.agents", description=__doc__)
@@ -214,47 +274,34 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--max-frames", type=int, default=500_000, help=longest)
     parser.add_argument("--rows", type=int, nargs="+", default=[4096, 65536], help="with --device: environments")
     parser.add_argument("--together", type=int, nargs="*", default=[64, 1024], help="with --device: seeds of one job")
-    options = ladder.parsed(parser, arguments, seconds=2.0, limit=3600.0)
+    options = ladder.parsed(parser, arguments, seconds=2.0)
     require(
         *at_least_one(max_frames=options.max_frames, rows=min(options.rows), together=min(options.together, default=1)),
         (options.seeds >= 0, f"seeds must be >= 0, got {options.seeds}"),
     )
-    if options.cells == []:
-        options.cells = known
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     if options.device:
-        print(on_device(checked_device(options.device), options))
+        device = checked_device(options.device)
+        on_device = []
+        for rung in rungs(device, options.rows, options.together):
+            if rung.name == ENVIRONMENT or rung.name.partition(",")[0] in options.agents:
+                on_device.append(rung)
+        ladder.climb(on_device, options, device)
+        print(ladder.report(on_device, options, device, ENVIRONMENT))
         return
-    measured = learned(options)
-    about = f"{ladder.machine(torch.device('cpu'))}; medians of {options.rounds} rounds and {options.seeds} seeds"
-    print(f"{about}\n\n{table(measured)}")
-
-
-def learned(options: ladder.Options) -> list[Contender]:
-    """Let agents learn as the options say, or until Ctrl-C; return them."""
     console = Console(stderr=True)
     if not find_spec("sb3_contrib"):
         missing = "Stable-Baselines3 is missing and not measured: pip install 'ctgraph_rl[benchmark]'"
         console.print(missing, markup=False, soft_wrap=True)
     if not find_spec("jax"):
         console.print("JAX is missing and not measured: pip install jax", markup=False, soft_wrap=True)
-    measured = list(contenders(options.agents) if options.cells is None else cells(options.cells))
-    learners = [contender.make(0) for contender in track(measured, "building", console=console)]
-    for learner in learners:
-        learner.learn()
-    start = time.perf_counter()
-    pairs = list(zip(measured, learners, strict=True))
-    with suppress(KeyboardInterrupt):
-        for contender, learner in ladder.until(
-            options.limit, track(pairs * options.rounds, "measuring", console=console)
-        ):
-            contender.measure(learner, options.seconds)
-        left = options.limit - (time.perf_counter() - start)
-        work = [(seed, contender) for seed in range(options.seeds) for contender in measured]
-        for seed, contender in ladder.until(left, track(work, "learning", console=console)):
-            contender.solve(seed, options.max_frames)
-    return measured
+    measured = list(contenders(options.agents) if options.cells is None else cells(options.cells or known))
+    speeds = [one.rung for one in measured]
+    ladder.climb(speeds, options, CPU, in_turn=True)
+    print(ladder.report(speeds, options, CPU, "ours"))
+    if options.seeds:
+        print(f"\n{times_to_solve(measured, options)}")
 
 
 if __name__ == "__main__":

@@ -9,11 +9,11 @@ import argparse
 import platform
 import statistics
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from rich.console import Console
@@ -32,7 +32,6 @@ from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.log.escape import markdown_table
 from ctgraph_rl.tasks.task import Task
 
-T = TypeVar("T")
 Options = argparse.Namespace
 
 TimedRun = Callable[[], int]
@@ -196,23 +195,21 @@ def _replayed(region: Region, rows: Rows, actions: Tensor) -> TimedRun:
     return run
 
 
-def parsed(parser: argparse.ArgumentParser, arguments: list[str] | None, seconds: float, limit: float) -> Options:
+def parsed(parser: argparse.ArgumentParser, arguments: list[str] | None, seconds: float) -> Options:
     """Return the options of a benchmark.
 
     Args:
         arguments: None: those of this process.
         seconds: default of the least time of a measurement.
-        limit: default of the seconds after which no measurement begins.
 
     Raises:
         ValueError: for numbers out of range.
     """
     parser.add_argument("--rounds", type=int, default=5, help="how often each is measured")
     parser.add_argument("--seconds", type=float, default=seconds, help="least time of a measurement")
-    parser.add_argument("--limit", type=float, default=limit, help="seconds after which no measurement begins")
     parser.add_argument("--device", default=None, help="instead: the ladder of the tensor engine there, such as cuda")
     options = parser.parse_args(arguments)
-    require(*at_least_one(rounds=options.rounds), *positive(seconds=options.seconds, limit=options.limit))
+    require(*at_least_one(rounds=options.rounds), *positive(seconds=options.seconds))
     return options
 
 
@@ -226,7 +223,7 @@ def climb(rungs: list[Rung], options: Options, device: torch.device, in_turn: bo
     rounds = 1 if in_turn else options.rounds
     times = options.rounds if in_turn else 1
     with suppress(KeyboardInterrupt):
-        for rung in until(options.limit, track(rungs * times, "measuring", console=Console(stderr=True))):
+        for rung in track(rungs * times, "measuring", console=Console(stderr=True)):
             measure(rung, rounds, options.seconds, device)
 
 
@@ -249,7 +246,7 @@ def measure(rung: Rung, rounds: int, seconds: float, device: torch.device) -> No
     """Measure observations a second, or note why a way fails."""
     try:
         run = rung.make()
-        for _ in range(WARM_UP + 1):
+        for _ in range(WARM_UP + 1 if device.type == "cuda" else 1):
             run()
         start = finished(device)
         run()
@@ -265,19 +262,12 @@ def measure(rung: Rung, rounds: int, seconds: float, device: torch.device) -> No
 
 
 def finished(device: torch.device) -> float:
-    """Return the time in seconds, once a device is idle."""
+    """Return the time in seconds, once a device is idle; with one thread that of the process."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
+    elif torch.get_num_threads() == 1:
+        return time.process_time()
     return time.perf_counter()
-
-
-def until(limit: float, items: Iterable[T]) -> Iterator[T]:
-    """Yield items for some seconds."""
-    start = time.perf_counter()
-    for item in items:
-        if time.perf_counter() - start > limit:
-            return
-        yield item
 
 
 def found(measured: Sequence[Rung], yardstick: str = COPY) -> list[dict[str, Any]]:

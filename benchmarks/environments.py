@@ -234,7 +234,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--tasks", nargs="+", default=names, choices=names, help="what is measured")
     parser.add_argument("--skip-kernel", action="store_true", help="leave out the C kernel, which needs a compiler")
     parser.add_argument("--threads", type=int, default=None, help="threads of torch")
-    options = ladder.parsed(parser, arguments, seconds=0.2, limit=600.0)
+    options = ladder.parsed(parser, arguments, seconds=0.2)
     rows = options.rows or ([65536, 262144] if options.device else [1, 64, 1024, 16384])
     require(*at_least_one(rows=min(rows)))
     if options.threads:

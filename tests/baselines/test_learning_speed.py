@@ -215,18 +215,19 @@ def test_an_agent_with_an_lstm_is_not_compiled(small_agent, name):
         small_agent(name, [ct_su_b1()], "+agent.compile=true")
 
 
+def cells_of(lines: list[str], column: int) -> list[str]:
+    return [line.split("|")[column].strip() for line in lines]
+
+
 @pytest.mark.slow
 def test_the_benchmark_prints_a_row_for_everybody(capsys):
     benchmark.main(["--agents", "a2c", "--rounds", "1", "--seconds", "0.001", "--seeds", "1", "--max-frames", "1"])
 
-    lines = capsys.readouterr().out.splitlines()[2:]
-    assert [line.split("|")[3].strip() for line in lines[2:]] == [
-        "ours",
-        "SB3, 256 rows, SB3VecEnv",
-        "SB3, 256 rows, make_vec_env",
-        "SB3, its defaults, 8 rows",
-    ]
-    assert all("0 of 1 seeds" in line for line in lines[2:])
+    lines = capsys.readouterr().out.splitlines()
+    who = ["ours", "SB3, 256 rows, SB3VecEnv", "SB3, 256 rows, make_vec_env", "SB3, its defaults, 8 rows"]
+    assert cells_of(lines[4:8], 3) == who
+    assert cells_of(lines[11:], 2) == who
+    assert cells_of(lines[11:], 3) == ["0 of 1 seeds"] * 4
 
 
 def test_without_stable_baselines_and_jax_ours_is_measured_alone(capsys, monkeypatch):
@@ -237,12 +238,12 @@ def test_without_stable_baselines_and_jax_ours_is_measured_alone(capsys, monkeyp
     printed = capsys.readouterr()
     assert "pip install 'ctgraph_rl[benchmark]'" in printed.err.replace("\n", " ")
     assert "JAX is missing and not measured: pip install jax" in printed.err.splitlines()
-    assert [line.split("|")[3].strip() for line in printed.out.splitlines()[4:]] == ["ours"]
+    assert cells_of(printed.out.splitlines()[4:], 3) == ["ours"]
 
 
 def test_jax_learns_with_the_settings_of_ours():
     jax_ppo = pytest.importorskip("benchmarks.jax_ppo", reason="needs jax")
-    learner = jax_ppo.JAX("ppo", benchmark.settings("ppo"), benchmark.TASKS["CT-FO-B1"], 0)
+    learner = jax_ppo.JAX("ppo", benchmark.on_256_rows("ppo"), benchmark.TASKS["CT-FO-B1"], 0)
 
     for _ in range(10):
         assert learner.learn() == 8192
@@ -253,7 +254,7 @@ def test_jax_learns_with_the_settings_of_ours():
 def test_cells_are_measured_in_place_of_an_lstm(capsys):
     benchmark.main(["--cells", "none", "--rounds", "1", "--seconds", "0.001", "--seeds", "0"])
 
-    assert [line.split("|")[1].strip() for line in capsys.readouterr().out.splitlines()[4:]] == ["lstm_ppo cell=none"]
+    assert cells_of(capsys.readouterr().out.splitlines()[4:], 2) == ["lstm_ppo cell=none"]
 
 
 def test_a_benchmark_that_is_stopped_prints_what_it_has(capsys, monkeypatch):
@@ -261,13 +262,13 @@ def test_a_benchmark_that_is_stopped_prints_what_it_has(capsys, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(benchmark, "find_spec", lambda name: None)
-    monkeypatch.setattr(benchmark.Contender, "solve", stopped)
+    monkeypatch.setattr(benchmark, "solve", stopped)
 
     benchmark.main(["--agents", "a2c", "--rounds", "1", "--seconds", "0.001", "--seeds", "1"])
-    benchmark.main(["--agents", "a2c", "--rounds", "1", "--seconds", "0.001", "--seeds", "1", "--limit", "1e-9"])
 
-    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| a2c")]
-    assert [line.split("|")[3].strip() for line in lines] == ["ours"]
+    lines = [line for line in capsys.readouterr().out.splitlines() if "a2c" in line]
+    assert cells_of(lines[:1], 3) == ["ours"]
+    assert cells_of(lines[1:], 3) == ["0 of 0 seeds"]
 
 
 def test_the_ladder_of_a_device_has_both_agents_and_seeds_together(capsys, monkeypatch):
@@ -275,21 +276,35 @@ def test_the_ladder_of_a_device_has_both_agents_and_seeds_together(capsys, monke
 
     benchmark.main(["--device", "cpu", "--rows", "16", "--together", "2"])
 
-    lines = [line.split("|") for line in capsys.readouterr().out.splitlines()[4:]]
-    assert [line[3].strip() for line in lines] == [
+    assert cells_of(capsys.readouterr().out.splitlines()[4:], 3) == [
         *("environment only", "ppo, step by step", "ppo, captured", "ppo, compiled and captured"),
         *("ppo, 2 seeds as one job", "environment only", "lstm_ppo, step by step", "lstm_ppo, captured"),
         "lstm_ppo, 2 seeds as one job",
     ]
 
 
-def test_the_ratio_is_our_median_speed_over_theirs_and_most_seeds_must_solve():
-    ours = benchmark.Contender("ppo", "CT-FO-B1", "ours", None, [100.0, 300.0, 200.0], [(8, 1.0), None, (16, 3.0)])
-    theirs = benchmark.Contender("ppo", "CT-FO-B1", "SB3", None, [50.0, 10.0, 40.0], [None, None, (16, 3.0)])
+@pytest.mark.parametrize("name", ["ppo, step by step", "ppo, captured", "ppo, 2 seeds as one job"])
+def test_what_the_ladder_of_a_device_measures_learns(name):
+    cpu = torch.device("cpu")
+    [rung] = [rung for rung in benchmark.rungs(cpu, [16], [2]) if rung.name == name]
 
-    rows = [[cell.strip() for cell in line.split("|")[3:-1]] for line in benchmark.table([ours, theirs]).splitlines()]
+    ladder_of_envs.measure(rung, 2, 0.001, cpu)
 
-    assert rows[2:] == [["ours", "200", "", "12", "2.00"], ["SB3", "40", "5.0 x", "1 of 3 seeds", ""]]
+    assert (rung.failure, len(rung.speeds)) == ("", 2)
+
+
+def test_the_ratio_is_a_median_speed_by_ours():
+    rungs = [
+        ladder_of_envs.Rung("ours", "ppo", 256, None, speeds=[100.0, 300.0, 200.0]),
+        ladder_of_envs.Rung("SB3", "ppo", 256, None, speeds=[50.0, 10.0, 40.0]),
+    ]
+
+    assert [(row["per_second"], row["ratio"]) for row in ladder_of_envs.found(rungs, "ours")] == [(200, 1), (40, 0.2)]
+
+
+def test_most_seeds_must_solve_a_task():
+    assert benchmark.medians([(8, 1.0), None, (16, 3.0)]) == ("12", "2.00")
+    assert benchmark.medians([None, None, (16, 3.0)]) == ("1 of 3 seeds", "")
 
 
 @pytest.mark.slow

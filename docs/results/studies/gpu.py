@@ -19,7 +19,7 @@ from typing import Any
 
 import torch
 
-from benchmarks import agent_ladder as learning
+from benchmarks import agents as learning
 from benchmarks import environment_ladder as ladder
 from benchmarks.environments import configurations
 from ctgraph_rl.log.provenance import versions
