@@ -21,6 +21,7 @@ from ctgraph_rl.log.sheets import to_markdown as to_markdown
 from ctgraph_rl.runs.config import curriculum_of
 from ctgraph_rl.runs.settings import curriculum_names
 from ctgraph_rl.tasks.curriculum import LAGS, Curriculum, Stream
+from ctgraph_rl.tasks.exactness import MOST_HISTORIES, count_histories
 from ctgraph_rl.tasks.kinds.task_like import TaskLike
 from ctgraph_rl.tasks.memory import bank_bytes
 from ctgraph_rl.tasks.observability import POLICIES, state_entropy, states_per_observation
@@ -137,6 +138,9 @@ def _overview(curriculum: Curriculum, frames_per_second: float | None) -> Sheet:
     if are_graphs(curriculum.examples):
         bank, per_row = memory(curriculum)
         evaluations = _duration(_evaluation_seconds(curriculum))
+        histories = max(count_histories(task, reads_actions=False) for task in _graphs(curriculum))
+        if curriculum.evaluation.exact and histories > MOST_HISTORIES:
+            rows["evaluation"] += " Agents with memory are refused: they have too many histories."
         rows["memory"] = f"{bank:,} bytes of images, and {per_row:,} for each row"
         rows["time"] = f"{_time(curriculum, frames_per_second)}; {evaluations} for evaluations, estimated"
     return Sheet(curriculum.name, {"what": "l", "value": "l"}, tuple(rows.items()))

@@ -10,7 +10,6 @@ less than (d + 1) times that.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
@@ -27,15 +26,11 @@ from ctgraph_rl.core.rewards import Arrival
 from ctgraph_rl.learn.collect import PREVIOUS_ACTION, TRIAL, InitialState, Step
 from ctgraph_rl.learn.logits_policy import as_policy
 from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.exactness import INSTEAD, MOST_HISTORIES, count_histories, longest_stay, num_views, task_rules
 from ctgraph_rl.tasks.kinds.task_like import TaskLike
 from ctgraph_rl.tasks.memory import bank_key, make_bank
 from ctgraph_rl.tasks.task import Task, are_graphs
 from ctgraph_rl.tasks.values import Measures, policy_measures
-
-LEAST_STAY = 1e-12
-
-MOST_HISTORIES = 2**22
-"""Most histories that are played: 10 s of an LSTM on one core."""
 
 HISTORIES_AT_ONCE = 2**15
 
@@ -131,25 +126,16 @@ def exact_rules(policy: object, task: TaskLike, start: Step, name: str | None = 
         start: the recurrent state before an episode, of one row; empty without memory.
         name: in messages; None: the policy's class.
     """
-    episodes = "set evaluation.exact=false, which plays episodes"
-    kind = type(task).__name__
-    yield isinstance(task, Task), f"exact evaluation needs CT-graphs, got {kind}: {episodes}"
-    if not isinstance(task, Task):
-        return
+    yield from task_rules(task)
     name = type(policy).__name__ if name is None else name
     has_probs = hasattr(policy, "action_probs")
-    yield has_probs, f"exact evaluation needs a policy with action_probs, which {name} has not: {episodes}"
-    lasts = f"exact evaluation needs episodes that do not depend on earlier ones, as those of {name} do: {episodes}"
+    yield has_probs, f"exact evaluation needs a policy with action_probs, which {name} has not: {INSTEAD}"
+    lasts = f"exact evaluation needs episodes that do not depend on earlier ones, as those of {name} do: {INSTEAD}"
     yield TRIAL not in start, lasts
-    noise = task.observations.read_noise
-    yield noise == 0, f"exact evaluation needs images without noise, got read_noise={noise}: {episodes}"
-    change = task.goal_change
-    yield change is None, f"exact evaluation needs a goal that stays, got goal_change={change}: {episodes}"
-    if start and noise == 0:
-        reads_actions = PREVIOUS_ACTION in start
-        count = count_histories(task, reads_actions)
+    if start and all(holds for holds, _ in task_rules(task)):
+        count = count_histories(task, PREVIOUS_ACTION in start)  # type: ignore[arg-type]
         many = f"exact evaluation with memory plays all histories, here {count:.2g}, and at most {MOST_HISTORIES:,}"
-        yield count <= MOST_HISTORIES, f"{many}: {episodes}"
+        yield count <= MOST_HISTORIES, f"{many}: {INSTEAD}"
 
 
 def shown_id(curriculum: Curriculum, task: TaskLike) -> Tensor | None:
@@ -161,28 +147,6 @@ def shown_id(curriculum: Curriculum, task: TaskLike) -> Tensor | None:
     if task in curriculum.task_ids:
         shown[curriculum.task_ids[task]] = 1
     return shown
-
-
-def count_histories(task: Task, reads_actions: bool) -> float:
-    """Return how many histories of an episode without failure an agent with memory can have, without long stays."""
-    graph = task.graph
-    x = task.observations
-    stays = _longest_stay(graph.wait_prob)
-    of_waits = 1 if x.is_unique(StateType.WAIT) else x.wait_ids[1] - x.wait_ids[0] + 1
-    of_decisions = 1 if x.is_unique(StateType.DECISION) else x.decision_ids[1] - x.decision_ids[0] + 1
-    views = _num_views(task)
-    waits = sum(math.pow(of_waits * views, length) for length in range(1, stays + 1)) if stays < 100 else math.inf
-    first = (x.home_ids[1] - x.home_ids[0] + 1) * views * (graph.branching_factor + 1 if reads_actions else 1)
-    level = waits * of_decisions * views * graph.branching_factor
-    return float(first) * math.pow(level, graph.depth) * waits
-
-
-def _longest_stay(wait_prob: float) -> int:
-    return 1 if wait_prob == 0 else 1 + math.ceil(math.log(LEAST_STAY) / math.log(wait_prob))
-
-
-def _num_views(task: Task) -> int:
-    return task.images.num_variants * (task.observations.read_rotation + 1)
 
 
 def _measure_function(policy: ActionProbs | nn.Module, task: Task, gamma: float) -> Measures:
@@ -281,7 +245,7 @@ def _tables(seeds: _Seeds) -> Tensor:
     task = seeds.shown.task
     x = task.observations
     ids = torch.cat([torch.arange(first, last + 1, device="cpu") for first, last in (x.wait_ids, x.decision_ids)])
-    views = _num_views(task)
+    views = num_views(task)
     rows = (ids.unsqueeze(1) * views + torch.arange(views, device="cpu")).flatten()
     bank = seeds.shown.bank
     found = []
@@ -325,7 +289,7 @@ class _Enumeration:
         self.gamma = gamma
         self.bank = seeds.shown.bank
         self.paid = self._paid()
-        self.stays = _longest_stay(self.task.graph.wait_prob)
+        self.stays = longest_stay(self.task.graph.wait_prob)
         zeros = torch.zeros(seeds.num_seeds, dtype=torch.float64, device="cpu")
         self.sums = {each.name: zeros.clone() for each in fields(Measures)}
 
@@ -391,7 +355,7 @@ class _Enumeration:
     ) -> tuple[_Histories, Tensor, Step]:
         """Return the histories split by images, and what `_Seeds.action_probs` returns."""
         x = self.task.observations
-        views = _num_views(self.task)
+        views = num_views(self.task)
         count = len(histories.node)
         if x.is_unique(kind):
             number = histories.node - self.task.graph.first_node(level)

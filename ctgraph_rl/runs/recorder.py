@@ -27,6 +27,7 @@ from ctgraph_rl.disk import is_writable, make_folder
 from ctgraph_rl.learn.adapt import adapt
 from ctgraph_rl.learn.collect import Policy, agent_specs
 from ctgraph_rl.learn.evaluate import Evaluator, by_slices
+from ctgraph_rl.learn.exact import exact_rules
 from ctgraph_rl.learn.refusals import check_lines
 from ctgraph_rl.log.files import CHECKPOINTS, LOG, METRICS
 from ctgraph_rl.log.provenance import code_changes, full_name
@@ -138,7 +139,10 @@ class Recorder:
             ),
             (writes, "overwrite, resume and logger need a run_dir"),
         )
-        curriculum.evaluation.check((*curriculum.examples, *curriculum.evaluation.held_out))
+        how = curriculum.evaluation
+        how.check((*curriculum.examples, *how.held_out))
+        late = "evaluation.exact=true needs evaluation.before=true: it shows before training whether a policy has exact"
+        require((how.before or not how.exact, f"{late} means"))
         check_lines(curriculum)
         self.curriculum = curriculum
         self.run_dir = None if run_dir is None else as_path("run_dir", run_dir)
@@ -401,12 +405,17 @@ class Recorder:
         return by_slices([self._adapt(policy_for(ids[task])) for task in tasks])
 
     def _adapt(self, policy: Any) -> Policy:
-        return adapt(
+        curriculum = self.curriculum
+        acts = adapt(
             policy,
-            greedy=self.curriculum.evaluation.greedy,
-            num_actions=getattr(agent_specs(self.curriculum).action, "n", None),
-            shows_ids=self.curriculum.protocol.task_id == "one_hot",
+            greedy=curriculum.evaluation.greedy,
+            num_actions=getattr(agent_specs(curriculum).action, "n", None),
+            shows_ids=curriculum.protocol.task_id == "one_hot",
         )
+        if curriculum.evaluation.exact:
+            name = getattr(policy, "__name__", type(policy).__name__)
+            require(*exact_rules(acts, curriculum.examples[0], {}, name))
+        return acts
 
 
 def _is_code(code: object) -> bool:

@@ -26,6 +26,7 @@ from ctgraph_rl.checks import (
     require,
 )
 from ctgraph_rl.tasks.curriculum_json import read_curriculum, type_name, write_curriculum
+from ctgraph_rl.tasks.exactness import task_rules
 from ctgraph_rl.tasks.kinds.task_like import TaskLike, are_tasks
 from ctgraph_rl.tasks.life import DrawnTasks, Lazy, Life
 from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol, count_rule
@@ -102,6 +103,9 @@ class Curriculum:
             (one_each, "task ids given at_boundaries need blocks of one task each"),
             (evaluates, "nothing would be evaluated: set before, every or at_block_ends"),
         )
+        if how.exact:
+            for task in everything:
+                require(*task_rules(task))
 
     def __repr__(self) -> str:
         return f"<Curriculum {self._summary}>"

@@ -17,18 +17,22 @@ from ctgraph_rl import (
     Curriculum,
     Evaluation,
     Gradient,
+    GymTask,
     OneHot,
     Protocol,
+    Recorder,
     evaluate,
     exact_success,
     exact_value,
     learn_curriculum,
     make_agent,
 )
+from ctgraph_rl.describe import describe
 from ctgraph_rl.learn.collect import PREVIOUS_ACTION
-from ctgraph_rl.learn.exact import ShownTask, count_histories, exact_measures, measures_by_seed, shown_id
+from ctgraph_rl.learn.exact import ShownTask, exact_measures, measures_by_seed, shown_id
 from ctgraph_rl.learn.logits_policy import LogitsPolicy
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_posr_b1, ct_su_b1
+from ctgraph_rl.tasks.exactness import count_histories
 from ctgraph_rl.tasks.values import open_loop_ceiling
 
 
@@ -256,7 +260,6 @@ def test_a_run_logs_exact_means_of_trained_held_out_and_masked_tasks():
     [
         ("mohqa", {}, "^exact evaluation needs a policy with action_probs, which MOHQA has not: [^;]*$"),
         ("rl2", {}, "needs episodes that do not depend on earlier ones, as those of RL2 do"),
-        ("ppo", {"observations": replace(ct_su_b1().observations, read_noise=2)}, "without noise, got read_noise=2"),
         ("lstm_ppo", {"graph": replace(ct_su_b1().graph, wait_prob=0.9)}, "plays all histories, here"),
     ],
 )
@@ -271,6 +274,53 @@ def test_what_has_no_exact_measures_is_refused_before_training(name, change, rea
         make_agent(name, curriculum)
     with pytest.raises(ValueError, match=reason):
         learn_curriculum(curriculum, agent)
+
+
+NOISE = replace(ct_su_b1(), observations=replace(ct_su_b1().observations, read_noise=2))
+CHANGES = replace(ct_su_b1(), goal_change=(2, 2))
+LAKE = GymTask("FrozenLake-v1")
+
+
+@pytest.mark.parametrize(
+    ("task", "reason"),
+    [
+        (NOISE, "needs images without noise, got read_noise=2"),
+        (CHANGES, r"needs a goal that stays, got goal_change=\(2, 2\)"),
+        (LAKE, "needs CT-graphs, got GymTask"),
+    ],
+)
+def test_a_curriculum_of_tasks_without_exact_measures_is_refused_wherever_it_is_made(task, reason):
+    played = Curriculum("own", 1, "none", (Block(task, 8192),), Evaluation(episodes_per_row=2, num_episodes=4))
+
+    with pytest.raises(ValueError, match=f"^exact evaluation {reason}: set evaluation.exact=false, which plays"):
+        replace(played, evaluation=Evaluation(exact=True))
+
+
+def test_held_out_tasks_without_exact_measures_are_refused():
+    with pytest.raises(ValueError, match="got read_noise=2"):
+        replace(curricula.load("su_b1_4tasks"), evaluation=Evaluation(exact=True, held_out=(NOISE,)))
+
+
+def test_a_recorder_refuses_before_training_what_has_no_exact_measures():
+    late = replace(curricula.load("su_b1_4tasks"), evaluation=Evaluation(exact=True, before=False))
+
+    with pytest.raises(ValueError, match=r"^evaluation.exact=true needs evaluation.before=true: it shows before train"):
+        Recorder(late)
+    with Recorder(replace(late, evaluation=Evaluation(exact=True, greedy=False))) as recorder:
+        with pytest.raises(ValueError, match=r"action_probs, which navigate has not: set evaluation.exact=false"):
+            recorder.evaluate(navigate, 0)
+        assert recorder.evaluate(nn.Sequential(nn.Flatten(), nn.Linear(144, 3)), 0)["goal1.1"] > 0
+
+
+def test_a_description_says_that_agents_with_memory_are_refused_where_they_are():
+    exact = replace(curricula.load("su_b1_4tasks"), evaluation=Evaluation(exact=True))
+    waits = tuple(replace(task, graph=replace(task.graph, wait_prob=0.9)) for task in exact.tasks)
+
+    said = [
+        str(dict(describe(each)[0].rows)["evaluation"]) for each in (exact, replace(exact, blocks=(Block(waits, 64),)))
+    ]
+
+    assert ["Agents with memory are refused" in each for each in said] == [False, True]
 
 
 def test_a_goal_that_changes_and_what_is_no_policy_have_no_exact_measures():
