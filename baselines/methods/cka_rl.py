@@ -12,10 +12,8 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from baselines.methods.method import TaskMethod
-from baselines.methods.parts.weights import Weights, flat, head_names, write_flat
-from baselines.parts.learner import Learner
+from baselines.methods.parts.weights import flat, head_names, write_flat
 from ctgraph_rl.checks import at_least_one, one_of, positive, require, true_or_false
-from ctgraph_rl.tasks.curriculum import Curriculum
 
 SCOPES = ("actor_head", "all")
 
@@ -67,25 +65,25 @@ class CKARL(TaskMethod):
         self.factor = scale * alpha_rate
 
     @override
-    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        names = weights.names if self.scope == "all" else head_names(agent.policy, without="state_value")
-        self.inside = [name in names for name in weights.names]
-        message = f"{type(agent).__name__} has no output layer behind a trunk for scope=actor_head: set scope=all"
+    def setup(self) -> None:
+        names = self.weights.names if self.scope == "all" else head_names(self.agent.policy, without="state_value")
+        self.inside = [name in names for name in self.weights.names]
+        message = f"{type(self.agent).__name__} has no output layer behind a trunk for scope=actor_head: set scope=all"
         require((any(self.inside), message))
-        self.in_scope = weights.mask_of(names)
-        super().setup(agent, weights, curriculum)
+        self.in_scope = self.weights.mask_of(names)
+        super().setup()
         self.ended = self.num_pooled = 0
-        own = self._within(weights.parameters)
+        own = self._within(self.weights.parameters)
         vector = flat(own).detach()
         self.register_buffer("base", torch.zeros_like(vector))
         self.register_buffer("pool", vector.new_zeros(self.pool_size, len(vector)))
         self.register_buffer("kept", vector.new_zeros(self.num_tasks, len(vector)))
         self.own = nn.ParameterList([each.detach().clone() for each in own])
         self.alpha = nn.Parameter(vector.new_zeros(self.pool_size))
-        agent.replace_optimiser(self.trainable)
+        self.agent.replace_optimiser(self.trainable)
 
     @override
-    def num_kept(self, weights: Weights) -> int:
+    def num_kept(self) -> int:
         return int(self.in_scope.sum())
 
     @property

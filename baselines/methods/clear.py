@@ -15,11 +15,8 @@ from torch import Tensor
 from typing_extensions import override
 
 from baselines.methods.method import Method
-from baselines.methods.parts.weights import Weights
-from baselines.parts.learner import Learner
 from baselines.parts.networks import Data, Items, TensorsByName, sequences_of
 from ctgraph_rl.checks import NamedValues, at_least_one, not_negative, require, require_memory
-from ctgraph_rl.tasks.curriculum import Curriculum
 
 
 class Reservoir:
@@ -91,13 +88,12 @@ class CLEAR(Method):
         self.value_coeff = value_coeff
 
     @override
-    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        super().setup(agent, weights, curriculum)
-        steps = agent.num_steps if agent.memory else 1
+    def setup(self) -> None:
+        steps = self.agent.num_steps if self.agent.memory else 1
         message = f"buffer_size must be at least the {steps} steps of a row, got {self.buffer_size}"
         require((self.buffer_size >= steps, message))
-        state = sum(each.nbytes for each in agent.initial_state(1).values())
-        size = math.prod(curriculum.tasks[0].observation_shape) + state
+        state = sum(each.nbytes for each in self.agent.initial_state(1).values())
+        size = math.prod(self.curriculum.tasks[0].observation_shape) + state
         require_memory(f"replay of buffer_size={self.buffer_size} steps", self.buffer_size * size, "steps")
         self.reservoir = Reservoir(self.buffer_size // steps)
 

@@ -9,8 +9,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from baselines.methods.method import Method
-from baselines.methods.parts.weights import Weights, flat, write_flat
-from baselines.parts.learner import Learner
+from baselines.methods.parts.weights import flat, write_flat
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import one_of, require
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -55,11 +54,10 @@ class Finetune(Method):
         return Unchanged().attach(agent, curriculum) if getattr(plasticity, "needs_starts", False) else agent
 
     @override
-    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        super().setup(agent, weights, curriculum)
+    def setup(self) -> None:
         self.register_buffer("learned", torch.zeros((), dtype=torch.bool, device="cpu"))
-        self.register_buffer("kept", weights.zeros())
-        self.register_buffer("in_heads", weights.in_heads)
+        self.register_buffer("kept", self.weights.zeros())
+        self.register_buffer("in_heads", self.weights.in_heads)
 
     @override
     def end_task(self) -> None:

@@ -15,11 +15,8 @@ from torch import Tensor
 from typing_extensions import override
 
 from baselines.methods.parts.selection import STREAM, SelectedMasks, own_generator
-from baselines.methods.parts.weights import Weights
-from baselines.parts.learner import Learner
 from ctgraph_rl.checks import NamedValues, at_least_one, one_of, positive, require, true_or_false
 from ctgraph_rl.learn.evaluate import evaluate
-from ctgraph_rl.tasks.curriculum import Curriculum
 
 DISTANCES = ("cosine", "l2")
 EPISODES = ("training", "evaluation", "none")
@@ -78,8 +75,8 @@ class MaskAMSC(SelectedMasks):
         """Summed returns and numbers of the episodes that ended in the last batches."""
 
     @override
-    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        super().setup(agent, weights, curriculum)
+    def setup(self) -> None:
+        super().setup()
         self.shuffle = own_generator(STREAM + 1)
 
     @override

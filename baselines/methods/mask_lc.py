@@ -12,9 +12,6 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from baselines.methods.parts.masks import Masks, combined, zero_betas
-from baselines.methods.parts.weights import Weights
-from baselines.parts.learner import Learner
-from ctgraph_rl.tasks.curriculum import Curriculum
 
 
 class MaskLC(Masks):
@@ -28,13 +25,13 @@ class MaskLC(Masks):
     betas: nn.Parameter  # b, float32 [weight tensors, tasks]; the last one in use is the new scores'
 
     @override
-    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        self.betas = zero_betas(weights, self.num_ids(curriculum))
-        super().setup(agent, weights, curriculum)
+    def setup(self) -> None:
+        self.betas = zero_betas(self.weights, self.num_ids)
+        super().setup()
 
     @override
-    def num_kept(self, weights: Weights) -> int:
-        return len(weights) + len(weights.parameters)
+    def num_kept(self) -> int:
+        return len(self.weights) + len(self.weights.parameters)
 
     @property
     @override

@@ -13,10 +13,7 @@ import torch
 from typing_extensions import override
 
 from baselines.methods.parts.selection import SelectedMasks
-from baselines.methods.parts.weights import Weights
-from baselines.parts.learner import Learner
 from ctgraph_rl.checks import at_least_one, is_real, one_of, require
-from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import Task, ct_graphs
 
 SELECTIONS = ("similarity", "random", "none", "all", "parent", "depth_prefix")
@@ -55,10 +52,10 @@ class MaskSC(SelectedMasks):
         self.reads_tasks = "the tasks' goals and images" if selection in ORACLES else ""
 
     @override
-    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        super().setup(agent, weights, curriculum)
+    def setup(self) -> None:
+        super().setup()
         if self.selection in ORACLES[1:]:
-            ct_graphs(curriculum.examples, f"selection={self.selection}")
+            ct_graphs(self.curriculum.examples, f"selection={self.selection}")
 
     @override
     def start_task(self, task: int | None) -> None:

@@ -13,10 +13,8 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from baselines.methods.parts.masks import Masks, zero_betas
-from baselines.methods.parts.weights import Weights, flat
-from baselines.parts.learner import Learner
+from baselines.methods.parts.weights import flat
 from ctgraph_rl.checks import NamedValues, at_least_one, require
-from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.task_like import most_actions
 
 
@@ -44,11 +42,11 @@ class MaskShared(Masks):
         self.max_received = max_received
 
     @override
-    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        self.num_actions = most_actions(curriculum.examples)
-        self.betas = zero_betas(weights, self.max_received + 1)
-        self._keep(torch.zeros(0, len(weights), dtype=torch.float32, device="cpu"))
-        super().setup(agent, weights, curriculum)
+    def setup(self) -> None:
+        self.num_actions = most_actions(self.curriculum.examples)
+        self.betas = zero_betas(self.weights, self.max_received + 1)
+        self._keep(torch.zeros(0, len(self.weights), dtype=torch.float32, device="cpu"))
+        super().setup()
 
     @property
     @override

@@ -62,6 +62,7 @@ class Method(TakesNumbers, Hooks):
 
     agent: Learner  # or another module with the members that `agent_members` lists
     weights: Weights
+    curriculum: Curriculum
 
     def __init__(self) -> None:  # nn.Module takes any arguments, a method only those that it names
         super().__init__()
@@ -128,14 +129,19 @@ class Method(TakesNumbers, Hooks):
         require((not missing, f"{message}: derive it from baselines.parts.learner.Learner, or take method=finetune"))
         return AgentWithMethod(cast(Learner, agent), self, curriculum)
 
-    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
+    def begin(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
+        """Set what it works on, and call `setup`."""
+        object.__setattr__(self, "agent", agent)  # the method is a submodule of the agent, not the other way round
+        self.weights = weights
+        self.curriculum = curriculum
+        self.setup()
+
+    def setup(self) -> None:
         """Called once when the method is attached: register buffers and parameters here.
 
         Raises:
             ValueError: if agent and method do not fit together.
         """
-        object.__setattr__(self, "agent", agent)  # the method is a submodule of the agent, not the other way round
-        self.weights = weights
 
     def network_weights(self, trained: list[nn.Parameter]) -> list[nn.Parameter]:
         """Return the network's, whatever the optimiser trains."""
@@ -157,9 +163,10 @@ class Method(TakesNumbers, Hooks):
         """Return the weights to act with in a task, float32 [P]; None for the present ones."""
         return None
 
-    def num_ids(self, curriculum: Curriculum) -> int:
-        """Return the most different ids that tasks start with."""
-        return len(curriculum.tasks) if self.max_labels is None else self.max_labels
+    @property
+    def num_ids(self) -> int:
+        """The most different ids that tasks start with."""
+        return len(self.curriculum.tasks) if self.max_labels is None else self.max_labels
 
 
 class TaskMethod(Method):
@@ -182,17 +189,16 @@ class TaskMethod(Method):
         self.slot = 0
 
     @override
-    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        super().setup(agent, weights, curriculum)
-        self.num_tasks = self.num_ids(curriculum)
-        self.bytes_per_task = 4 * self.num_kept(weights)
+    def setup(self) -> None:
+        self.num_tasks = self.num_ids
+        self.bytes_per_task = 4 * self.num_kept()
         kept = f"what {type(self).__name__} keeps of {self.num_tasks:,} tasks, {self.bytes_per_task:,} bytes each"
         needed = (1 + COPIES_TO_SAVE) * self.num_tasks * self.bytes_per_task
         require_memory(f"{kept}, and two copies while it is saved", needed, "tasks, such as curriculum.num_tasks")
 
-    def num_kept(self, weights: Weights) -> int:
+    def num_kept(self) -> int:
         """Return how many numbers it keeps for each task: one for each weight."""
-        return len(weights)
+        return len(self.weights)
 
     @override
     def start_task(self, task: int | None) -> None:
@@ -253,7 +259,7 @@ class AgentWithMethod(nn.Module):
     def __init__(self, agent: Learner, method: Method, curriculum: Curriculum) -> None:
         super().__init__()
         self.agent: Learner = agent
-        method.setup(agent, Weights(agent.policy, agent.weights), curriculum)
+        method.begin(agent, Weights(agent.policy, agent.weights), curriculum)
         agent.method = method
         self.num_envs = agent.num_envs
         self.num_steps = agent.num_steps

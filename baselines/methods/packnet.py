@@ -14,10 +14,8 @@ from typing_extensions import override
 
 from baselines.methods.method import TaskMethod
 from baselines.methods.parts.heads import Heads
-from baselines.methods.parts.weights import Weights, flat, write_flat
-from baselines.parts.learner import Learner
+from baselines.methods.parts.weights import flat, write_flat
 from ctgraph_rl.checks import is_real, require
-from ctgraph_rl.tasks.curriculum import Curriculum
 
 FREE = -1
 
@@ -55,21 +53,21 @@ class PackNet(TaskMethod):
         self.heads = Heads()
 
     @override
-    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        super().setup(agent, weights, curriculum)
-        self.heads.setup(agent, weights, curriculum)
-        self.budgets = [block.num_frames for block in curriculum.blocks]
+    def setup(self) -> None:
+        super().setup()
+        self.heads.begin(self.agent, self.weights, self.curriculum)
+        self.budgets = [block.num_frames for block in self.curriculum.blocks]
         self.block = -1
         self.frames = 0
-        self.register_buffer("owner", weights.zeros(torch.int16) + FREE)
-        self.register_buffer("packed", weights.zeros())
-        self.register_buffer("live", ~weights.zeros(torch.bool))
-        self.register_buffer("mine", weights.zeros(torch.bool))
-        self.in_matrices = weights.in_matrices & ~weights.in_heads
-        self.in_heads = weights.in_heads
+        self.register_buffer("owner", self.weights.zeros(torch.int16) + FREE)
+        self.register_buffer("packed", self.weights.zeros())
+        self.register_buffer("live", ~self.weights.zeros(torch.bool))
+        self.register_buffer("mine", self.weights.zeros(torch.bool))
+        self.in_matrices = self.weights.in_matrices & ~self.weights.in_heads
+        self.in_heads = self.weights.in_heads
 
     @override
-    def num_kept(self, weights: Weights) -> int:
+    def num_kept(self) -> int:
         return 0  # beside the output layers
 
     @torch.no_grad()

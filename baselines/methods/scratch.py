@@ -6,9 +6,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from baselines.methods.method import TaskMethod
-from baselines.methods.parts.weights import Weights, require_drawn
-from baselines.parts.learner import Learner
-from ctgraph_rl.tasks.curriculum import Curriculum
+from baselines.methods.parts.weights import require_drawn
 
 
 class Scratch(TaskMethod):
@@ -23,10 +21,10 @@ class Scratch(TaskMethod):
     kept: Tensor  # float32 [tasks, P]
 
     @override
-    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        super().setup(agent, weights, curriculum)
-        require_drawn(agent.policy, "Scratch")
-        self.register_buffer("kept", weights.zeros().repeat(self.num_tasks, 1))
+    def setup(self) -> None:
+        super().setup()
+        require_drawn(self.agent.policy, "Scratch")
+        self.register_buffer("kept", self.weights.zeros().repeat(self.num_tasks, 1))
 
     @override
     def start_task(self, task: int | None) -> None:

@@ -13,10 +13,8 @@ from torch import Tensor
 from typing_extensions import override
 
 from baselines.methods.parts.importance import Importance
-from baselines.methods.parts.weights import Weights, flat
-from baselines.parts.learner import Learner
+from baselines.methods.parts.weights import flat
 from ctgraph_rl.checks import positive, require
-from ctgraph_rl.tasks.curriculum import Curriculum
 
 
 class SI(Importance):
@@ -48,10 +46,10 @@ class SI(Importance):
         self.epsilon = epsilon
 
     @override
-    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        super().setup(agent, weights, curriculum)
+    def setup(self) -> None:
+        super().setup()
         for name in ("path", "start", "before", "slope"):
-            self.register_buffer(name, weights.zeros())
+            self.register_buffer(name, self.weights.zeros())
 
     @override
     @torch.no_grad()

@@ -7,10 +7,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from baselines.methods.method import TaskMethod
-from baselines.methods.parts.weights import Weights
-from baselines.parts.learner import Learner
 from ctgraph_rl.checks import require
-from ctgraph_rl.tasks.curriculum import Curriculum
 
 
 class Heads(TaskMethod):
@@ -24,16 +21,16 @@ class Heads(TaskMethod):
     kept: Tensor  # float32 [tasks, H]
 
     @override
-    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        super().setup(agent, weights, curriculum)
-        self.in_heads = weights.in_heads
-        message = f"{type(agent).__name__} has no output layers behind a trunk, so tasks cannot have their own"
+    def setup(self) -> None:
+        super().setup()
+        self.in_heads = self.weights.in_heads
+        message = f"{type(self.agent).__name__} has no output layers behind a trunk, so tasks cannot have their own"
         require((bool(self.in_heads.any()), f"{message}: take a method that shares them, as some do with heads=single"))
-        self.register_buffer("kept", weights.vector().detach()[self.in_heads].repeat(self.num_tasks, 1))
+        self.register_buffer("kept", self.weights.vector().detach()[self.in_heads].repeat(self.num_tasks, 1))
 
     @override
-    def num_kept(self, weights: Weights) -> int:
-        return int(weights.in_heads.sum())
+    def num_kept(self) -> int:
+        return int(self.weights.in_heads.sum())
 
     @torch.no_grad()
     def start_task(self, task: int | None) -> None:

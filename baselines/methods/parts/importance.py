@@ -15,11 +15,9 @@ from typing_extensions import override
 
 from baselines.methods.method import Method
 from baselines.methods.parts.heads import Heads
-from baselines.methods.parts.weights import Weights, flat
-from baselines.parts.learner import Learner
+from baselines.methods.parts.weights import flat
 from baselines.parts.networks import Data, Items, TensorsByName
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, at_least_one, one_of, positive, require
-from ctgraph_rl.tasks.curriculum import Curriculum
 
 
 class Importance(Method):
@@ -51,16 +49,15 @@ class Importance(Method):
             self.agent_members = tuple(dict.fromkeys((*self.agent_members, *Heads.agent_members)))
 
     @override
-    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        super().setup(agent, weights, curriculum)
-        self.register_buffer("importance", weights.zeros())
-        self.register_buffer("anchor", weights.zeros())
-        ids = curriculum.protocol.task_id != "hidden" and not curriculum.blocks_of_several
+    def setup(self) -> None:
+        self.register_buffer("importance", self.weights.zeros())
+        self.register_buffer("anchor", self.weights.zeros())
+        ids = self.curriculum.protocol.task_id != "hidden" and not self.curriculum.blocks_of_several
         if self.heads_setting == "multi" or (self.heads_setting == "auto" and ids):
             self.heads = Heads()
             self.heads.max_labels = self.max_labels
-            self.heads.setup(agent, weights, curriculum)
-        in_heads = weights.zeros() if self.heads is None else weights.in_heads.float()
+            self.heads.begin(self.agent, self.weights, self.curriculum)
+        in_heads = self.weights.zeros() if self.heads is None else self.weights.in_heads.float()
         self.register_buffer("held", 1.0 - in_heads)
 
     @override

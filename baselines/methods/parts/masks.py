@@ -13,9 +13,7 @@ from typing_extensions import override
 
 from baselines.methods.method import TaskMethod
 from baselines.methods.parts.weights import Weights, flat
-from baselines.parts.learner import Learner
 from ctgraph_rl.checks import LARGEST_INT, is_int, require
-from ctgraph_rl.tasks.curriculum import Curriculum
 
 
 class Masks(TaskMethod):
@@ -52,25 +50,25 @@ class Masks(TaskMethod):
         self.backbone_seed = backbone_seed
 
     @override
-    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        super().setup(agent, weights, curriculum)
-        vectors = [name for name, each in weights.named if each.ndim < 2 and "bias" not in name.rpartition(".")[2]]
+    def setup(self) -> None:
+        super().setup()
+        vectors = [name for name, each in self.weights.named if each.ndim < 2 and "bias" not in name.rpartition(".")[2]]
         rule = f"{type(self).__name__} masks weight matrices, and {', '.join(vectors)} are none"
         require((not vectors, f"{rule}: take another method, or a network without such layers"))
         self.ended = 0
-        scores = weights.zeros().repeat(self.num_tasks, 1)
+        scores = self.weights.zeros().repeat(self.num_tasks, 1)
         own = self.initial_scores()
         if self.backbone_seed is not None:
             with torch.random.fork_rng(devices=[]):  # agents are built from torch's global generator of the CPU
                 torch.default_generator.manual_seed(self.backbone_seed)
-                agent.reset_parameters()
+                self.agent.reset_parameters()
                 scores = torch.stack([flat(self.initial_scores()) for _ in range(self.num_tasks)])
-            own = [part.clone() for part in weights.split(scores[0])]
-        constant = flat([_signed_constant(parameter) for parameter in weights.parameters])
+            own = [part.clone() for part in self.weights.split(scores[0])]
+        constant = flat([_signed_constant(parameter) for parameter in self.weights.parameters])
         self.register_buffer("constant", constant.detach())
         self.register_buffer("scores", scores)
         self.own = nn.ParameterList(own)
-        agent.replace_optimiser(self.trainable)
+        self.agent.replace_optimiser(self.trainable)
         self._write()
 
     @property

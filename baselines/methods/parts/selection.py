@@ -13,7 +13,6 @@ from torch.nn.functional import normalize
 from typing_extensions import override
 
 from baselines.methods.mask_lc import MaskLC
-from baselines.methods.parts.weights import Weights
 from baselines.parts.embedding import (
     linear_wasserstein,
     reference_points,
@@ -22,9 +21,7 @@ from baselines.parts.embedding import (
     unit_directions,
     with_last,
 )
-from baselines.parts.learner import Learner
 from ctgraph_rl.checks import NamedValues, TakesNumbers, at_least_one, one_of, require
-from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.task_like import TaskLike, most_actions
 
 EMBEDDINGS = ("lwe", "swe")
@@ -147,11 +144,10 @@ class SelectedMasks(MaskLC):
         self.num_batches = 0
 
     @override
-    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        self.curriculum = curriculum
-        self.ids = curriculum.protocol.ids(len(curriculum.tasks))
-        self.num_actions = most_actions(curriculum.examples)
-        super().setup(agent, weights, curriculum)
+    def setup(self) -> None:
+        self.ids = self.curriculum.protocol.ids(len(self.curriculum.tasks))
+        self.num_actions = most_actions(self.curriculum.examples)
+        super().setup()
         self.generator = own_generator()
         for name in ("community", "places", "offsets"):
             self.register_buffer(name, torch.zeros(0, dtype=torch.float32, device="cpu"), persistent=False)
@@ -161,9 +157,9 @@ class SelectedMasks(MaskLC):
         return self.curriculum.tasks[self.ids.index(self.started[slot])]
 
     @override
-    def num_kept(self, weights: Weights) -> int:
+    def num_kept(self) -> int:
         pixels = math.prod(self.curriculum.examples[0].observation_shape)
-        return super().num_kept(weights) + self.compares * self.embeddings.num_values(pixels + self.num_actions + 1)
+        return super().num_kept() + self.compares * self.embeddings.num_values(pixels + self.num_actions + 1)
 
     def choose(self) -> list[int]:
         """Return the slots of the tasks to select, among the first `num_combined`."""
