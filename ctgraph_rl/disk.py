@@ -119,6 +119,15 @@ def make_folder(folder: Path) -> Path:
     return folder
 
 
+def remove_empty(folder: Path) -> None:
+    """Remove a folder without files, and then empty folders above it in the working directory."""
+    here = Path.cwd()
+    with suppress(OSError):
+        for each in (folder, *folder.parents):
+            if each == folder or (each != here and each.is_relative_to(here)):
+                each.rmdir()
+
+
 def require_new(path: Path) -> None:
     """Refuse an existing path.
 

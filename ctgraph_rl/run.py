@@ -11,7 +11,7 @@ import shlex
 import sys
 from argparse import Namespace
 from collections.abc import Sequence
-from contextlib import redirect_stdout, suppress
+from contextlib import redirect_stdout
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.cli import first_imports, quiet_where_nobody_reads
+from ctgraph_rl.disk import remove_empty
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
 from ctgraph_rl.log.files import EX_TEMPFAIL, LOG
 from ctgraph_rl.packages import check_packages, conf_dir, makes_page
@@ -146,15 +147,6 @@ class HydraJob:
             if isinstance(error, ERRORS):
                 raise Stop(error, explain(error, cfg)) from error
             raise
-
-
-def remove_empty(run_dir: Path) -> None:
-    """Remove a run directory without files, and then empty folders above it in the working directory."""
-    here = Path.cwd()
-    with suppress(OSError):
-        for folder in (run_dir, *run_dir.parents):
-            if folder == run_dir or (folder != here and folder.is_relative_to(here)):
-                folder.rmdir()
 
 
 def main() -> None:

@@ -16,7 +16,6 @@ from typing_extensions import override
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.collective.summary import COLLECTIVE, FILES, describe_collective, read_collective, write_summary
-from ctgraph_rl.disk import make_folder
 from ctgraph_rl.learn.collective import ExchangeLike, learn_collective
 from ctgraph_rl.learn.progress import ProgressBar
 from ctgraph_rl.log.escape import terminal_text
@@ -88,7 +87,7 @@ def _learn(session: Session, cfg: Any, cells: Sequence[ConfigAndPath], exchange:
         if _is_replaced(cfg, cells):
             checkpoints.clear()
         for member in members:
-            session.lock(make_folder(member.run_dir))
+            session.lock(member.run_dir)
         for (each, _), member in zip(cells, members, strict=True):
             prepare(session, each, member)
             if each.experts:

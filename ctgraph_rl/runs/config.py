@@ -85,10 +85,13 @@ def plain(cfg: DictConfig) -> NamedValues:
 
     A tuning run keeps its objective, which tables show.
     """
-    kept = [str(key) for key in cfg if key != "hydra" and key not in NOT_HASHED]
-    if cfg.get("objective_until") is not None:
-        kept.append("objective")
-    values: Any = OmegaConf.to_container(OmegaConf.masked_copy(cfg, kept), resolve=True)
+    has_objective = cfg.get("objective_until") is not None
+    values: NamedValues = {}
+    for key in map(str, cfg):
+        is_kept = key not in NOT_HASHED and key != "hydra"
+        if is_kept or (key == "objective" and has_objective):
+            value = cfg[key]
+            values[key] = OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
     curriculum = values.get("curriculum")
     if isinstance(curriculum, dict) and isinstance(curriculum.get("goals"), list):
         goals = map(read_goal, curriculum["goals"])  # one run, however its goals are written
@@ -121,10 +124,10 @@ def name_of(cfg: DictConfig, choices: Any) -> str:
 def of_seed(cfg: DictConfig, seed: int, run_dir: Path) -> tuple[DictConfig, Path]:
     """Return the configuration and directory of one seed of a job; ``cfg`` is without its ``seeds``."""
     choices = HydraConfig.get().runtime.choices
-    folder = run_dir.parents[len(Path(name_of(cfg, choices)).parts) - 1]
     own = deepcopy(cfg)
     own.seed = seed
-    return own, folder / name_of(own, choices)
+    name = Path(name_of(own, choices))
+    return own, run_dir.parents[len(name.parts) - 1] / name
 
 
 def of_member(cfg: DictConfig, number: int, settings: ReadOnlyValues) -> DictConfig:

@@ -427,7 +427,11 @@ def run_seeds(cfg: Any, run_dir: Path) -> list[Path]:
     alone = "a sweep's seeds are given as seed=0,1 or seed=range(2), with -m, got seeds"
     require((config.in_sweep(), alone))
     seeds = cfg.seeds
-    are_seeds = isinstance(seeds, Sequence) and all(map(is_int, seeds)) and len({*seeds}) == len(seeds) > 0
+    are_seeds = (
+        isinstance(seeds, Sequence)
+        and all(is_int(seed, 0, 2**63 - 1) for seed in seeds)
+        and len({*seeds}) == len(seeds) > 0
+    )
     rule = f"seeds must be a list of different seeds that begins with seed={cfg.seed}, got {seeds}"
     require((are_seeds and seeds[0] == cfg.seed, rule))
     logging.getLogger("torchrl").setLevel(logging.WARNING)
@@ -435,9 +439,7 @@ def run_seeds(cfg: Any, run_dir: Path) -> list[Path]:
     with open_dict(shared):
         del shared["seeds"]  # else each of n cells copies n seeds
     cells = [config.of_seed(shared, seed, run_dir) for seed in seeds]
-    for each, folder in cells:
-        config.check_values(each)
-        folder.mkdir(parents=True, exist_ok=True)
+    config.check_values(cells[0][0])
     first = build(*cells[0])
     reason = why_not_together(first.curriculum) or why_agents_learn_alone(first.agent, checked_device(cfg.device))
     if cfg.freeze_after is not None and first.curriculum.protocol.task_id != "hidden":

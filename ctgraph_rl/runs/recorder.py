@@ -23,7 +23,7 @@ from ctgraph_rl.checks import (
     takes_numbers,
     true_or_false,
 )
-from ctgraph_rl.disk import is_writable, make_folder
+from ctgraph_rl.disk import is_writable
 from ctgraph_rl.learn.adapt import adapt
 from ctgraph_rl.learn.collect import Policy, agent_specs
 from ctgraph_rl.learn.evaluate import Evaluator, by_slices
@@ -168,7 +168,7 @@ class Recorder:
             is_read_only = resume and (self.run_dir / METRICS).exists() and not is_writable(self.run_dir)
             with Session() as session:
                 if not is_read_only:  # else no process can write
-                    session.lock(make_folder(self.run_dir))
+                    session.lock(self.run_dir)
                 self._open(self.run_dir, overwrite, resume)
                 if not self.finished:
                     if make_logger is not None:

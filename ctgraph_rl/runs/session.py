@@ -21,7 +21,7 @@ import torch
 from typing_extensions import override
 
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule, require
-from ctgraph_rl.disk import append_line, sync_folder, sync_folders, write_whole
+from ctgraph_rl.disk import append_line, make_folder, remove_empty, sync_folder, sync_folders, write_whole
 from ctgraph_rl.learn.collective import Member
 from ctgraph_rl.learn.loop import Alone, Group, Lockstep, run_loop
 from ctgraph_rl.learn.progress import ProgressBar
@@ -176,6 +176,7 @@ class Session:
     def __init__(self, console: Console | None = None) -> None:
         self.console = console
         self._stack = ExitStack()
+        self._folders = self._stack.enter_context(ExitStack())
         self._locks = self._stack.enter_context(closing(Locks()))
 
     def __enter__(self) -> Session:
@@ -188,11 +189,15 @@ class Session:
         """Return a session that takes over what this one would close."""
         other = Session(self.console)
         other._stack = self._stack.pop_all()
+        other._folders = self._folders
         other._locks = self._locks
         return other
 
     def lock(self, run_dir: Path, waiting: Callable[[], object] | None = None) -> None:
-        """Keep other writers out of a directory until the end, by `Locks.add`."""
+        """Make a directory, which is removed if it stays empty, and keep other writers out, by `Locks.add`."""
+        if not run_dir.is_dir():
+            make_folder(run_dir)
+            self._folders.callback(remove_empty, run_dir)
         self._locks.add(run_dir, waiting)
 
     def enter(self, part: AbstractContextManager[Opened]) -> Opened:

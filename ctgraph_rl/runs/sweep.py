@@ -22,6 +22,7 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, read_write
 
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, require
+from ctgraph_rl.learn.progress import StepCounter
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CHECKPOINTS, EX_TEMPFAIL, member_folder
 from ctgraph_rl.packages import check_packages, conf_dir
@@ -92,6 +93,7 @@ class Sweeper(Base):
         self.status = status
         self.variants = variants or ({},)
         self._values: dict[str, tuple[str, Any] | None] = {}
+        self._is_file: dict[str, bool] = {}
         self._stale: dict[Path, str] = {}
         self._begun: dict[Path, tuple[int, ...]] = {}
         self._known: dict[str, NamedValues] = {}
@@ -202,28 +204,30 @@ class Sweeper(Base):
         require((subdir == SUBDIR, f"hydra.sweep.subdir must be {SUBDIR}, got {subdir}; change hydra.sweep.dir"))
         composed: dict[tuple[Overrides, Overrides], DictConfig] = {}
         found: dict[Path, Overrides] = {}
-        for overrides in batch:
-            values = {}
-            choices = []
-            for setting in overrides:
-                changed = self._value(setting)
-                if changed is None:
-                    choices.append(setting)
-                else:
-                    values[changed[0]] = changed[1]
-            alike = tuple(choices), tuple(values)
-            if alike not in composed:
-                composed[alike] = self._composed(overrides, choices)
-                check_resolved(composed[alike])
-            for key, value in values.items():
-                OmegaConf.update(composed[alike], key, value)
-            check_settings(composed[alike])
-            self._has_tuning |= composed[alike].objective_until is not None
-            sweep = composed[alike].hydra.sweep
-            folder = Path(sweep.dir).absolute() / sweep.subdir
-            if folder not in found and self.config.overwrite is not True:
-                self._compare(composed[alike], folder)
-            found.setdefault(folder, overrides)
+        with StepCounter() as count:
+            for number, overrides in enumerate(batch, 1):
+                count("cells composed", number, len(batch))
+                values = {}
+                choices = []
+                for setting in overrides:
+                    changed = self._value(setting)
+                    if changed is None:
+                        choices.append(setting)
+                    else:
+                        values[changed[0]] = changed[1]
+                alike = tuple(choices), tuple(values)
+                if alike not in composed:
+                    composed[alike] = self._composed(overrides, choices)
+                    check_resolved(composed[alike])
+                for key, value in values.items():
+                    OmegaConf.update(composed[alike], key, value)
+                check_settings(composed[alike])
+                self._has_tuning |= composed[alike].objective_until is not None
+                sweep = composed[alike].hydra.sweep
+                folder = Path(sweep.dir).absolute() / sweep.subdir
+                if folder not in found and self.config.overwrite is not True:
+                    self._compare(composed[alike], folder)
+                found.setdefault(folder, overrides)
         return found
 
     def _composed(self, overrides: Overrides, choices: Overrides) -> DictConfig:
@@ -261,9 +265,10 @@ class Sweeper(Base):
             key = parsed.key_or_group
             value = parsed.value()
             plain = parsed.type == OverrideType.CHANGE and parsed.package is None and not isinstance(value, dict)
-            options = self.hydra_context.config_loader.get_group_options
-            is_file = key.startswith("hydra") or ("." not in key and options(key))  # asking Hydra is slow
-            self._values[setting] = (key, value) if plain and not is_file else None
+            if key not in self._is_file:  # asking Hydra is slow
+                options = self.hydra_context.config_loader.get_group_options
+                self._is_file[key] = key.startswith("hydra") or ("." not in key and bool(options(key)))
+            self._values[setting] = (key, value) if plain and not self._is_file[key] else None
         return self._values[setting]
 
     def _jobs(self, cells: Mapping[Path, Overrides]) -> dict[Overrides, list[Path]]:

@@ -11,6 +11,7 @@ import yaml
 from helpers.sweeping import UNLUCKY, command_line, configs, sweep
 
 from ctgraph_rl import run as run_module
+from ctgraph_rl.learn import progress
 from ctgraph_rl.packages import conf_dir
 from ctgraph_rl.runs import session
 from ctgraph_rl.runs.sweep import Sweeper, sweepable
@@ -42,6 +43,15 @@ def test_settings_of_a_variant_change_together(learned, monkeypatch, tmp_path, c
     assert command_line(monkeypatch, *chosen) == 1
     said = capsys.readouterr().err
     assert "is a sweep, seed=range(2) agent.num_envs=... agent.num_steps=...: add -m" in " ".join(said.split())
+
+
+def test_many_cells_are_counted_while_they_are_composed(learned, monkeypatch, capsys):
+    monkeypatch.setattr(progress, "QUICK", 0.0)
+    monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 0.0)
+
+    assert sweep(monkeypatch, "seed=range(2)") == 0
+
+    assert "2/2 cells composed" in capsys.readouterr().err
 
 
 def test_every_experiment_has_settings_that_the_sweeper_takes():

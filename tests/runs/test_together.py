@@ -21,6 +21,7 @@ from baselines.update.seeds import SeedGroup
 from ctgraph_rl import RunLog, disk
 from ctgraph_rl.compare import ROUNDING, compare
 from ctgraph_rl.log import run_log, sums, tables
+from ctgraph_rl.log.files import EX_TEMPFAIL, locked
 from ctgraph_rl.log.provenance import NUMBERS, NUMBERS_TOGETHER, code_changes
 from ctgraph_rl.report.page import write_report
 from ctgraph_rl.report.terminal import code_notes, group_size
@@ -379,13 +380,24 @@ def test_cells_of_a_group_do_not_copy_its_list_of_seeds(monkeypatch):
     assert copied == [False]
 
 
-def test_more_seeds_than_memory_holds_are_refused_before_they_learn(monkeypatch, capsys):
+def test_a_group_that_is_refused_leaves_no_folder(monkeypatch, capsys):
     monkeypatch.setattr(job, "WEIGHTS_KEPT", 10**12)
 
     assert sweep(monkeypatch, SEEDS, *PPO, "together=true") == 1
 
     said = " ".join("".join(capsys.readouterr()).split())
     assert "weights and a batch of 3 seeds need " in said and "use fewer seeds at a time" in said, said
+    assert [path.name for path in Path("runs").rglob("*")] == ["multirun.yaml"]
+
+
+def test_a_group_with_a_seed_in_use_leaves_no_folder_of_the_others(monkeypatch, together):
+    held = Path("runs") / runs(str(together))[2].relative_to(together)
+    held.mkdir(parents=True)
+
+    with locked(held):
+        assert sweep(monkeypatch, SEEDS, *PPO, "together=true") == EX_TEMPFAIL
+
+    assert [*held.parent.iterdir()] == [held]
 
 
 def learn_experts(given: list[DictConfig], task: int) -> None:
