@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.learning import train
 from helpers.reference_files import SHIPPED_2023
 from helpers.stopped_runs import Slow, limited
 
@@ -44,7 +45,7 @@ from ctgraph_rl.log.tables import write_tables
 from ctgraph_rl.policies import OptimalPolicy
 from ctgraph_rl.report import formats, results
 from ctgraph_rl.runs.read import find_runs
-from ctgraph_rl.runs.train import new_agent, train, with_method
+from ctgraph_rl.runs.train import new_agent, with_method
 from ctgraph_rl.tasks.configurations import ct_fo_b1, ct_su_b1
 from ctgraph_rl.tasks.images import IMAGE_SETS, OneHot
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift

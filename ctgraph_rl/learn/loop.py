@@ -21,15 +21,7 @@ from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues
 from ctgraph_rl.learn.collect import Policy, make_env, without_ends
 from ctgraph_rl.learn.evaluate import Evaluator, evaluate_together, measure
-from ctgraph_rl.learn.refusals import (
-    check_adaptation,
-    check_env,
-    check_episodes,
-    check_exact,
-    check_ids,
-    check_rows,
-    resumes,
-)
+from ctgraph_rl.learn.refusals import check_env, check_learner, resumes
 from ctgraph_rl.learn.segments import Segment, announced_id, collect_segment, guided, log_training, segments
 from ctgraph_rl.learn.unit_metrics import EACH_BATCH, UnitMeter, norms, weights_of
 from ctgraph_rl.log.run_log import RunLog
@@ -195,11 +187,7 @@ class Lockstep:
         freeze_after: float = 1.0,
         log_units: bool | str = False,
     ) -> None:
-        check_rows(curriculum, group.agents[0].num_envs)
-        check_ids(curriculum, group.agents[0])
-        check_episodes(curriculum, group.agents[0])
-        check_adaptation(curriculum, group.agents[0])
-        check_exact(curriculum, group.agents[0])
+        check_learner(curriculum, group.agents[0])
         self.curriculum = curriculum
         self.group = group
         self.seeds = seeds

@@ -16,10 +16,21 @@ from ctgraph_rl.core.rewards import KERNEL_REWARDS
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.exact import exact_rules
 from ctgraph_rl.tasks.curriculum import Curriculum, Stream
-from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.tasks.task import Task, are_graphs
 
 MOST_LINES = 2**20
 """Most lines of evaluations in a log."""
+
+
+def check_learner(curriculum: Curriculum, agent: Agent) -> None:
+    """Refuse an agent that cannot learn a curriculum, or be evaluated on it.
+
+    Raises:
+        ValueError: as the functions below.
+    """
+    check_rows(curriculum, agent.num_envs)
+    for check in (check_ids, check_episodes, check_adaptation, check_exact):
+        check(curriculum, agent)
 
 
 def check_rows(curriculum: Curriculum, num_envs: int) -> None:
@@ -159,6 +170,19 @@ def check_adaptation(curriculum: Curriculum, agent: Agent) -> None:
         (not without, f"{one}: give a block all goals, as nm_uniform_goals does, or its task a goal_change"),
         (how.row_episodes > needed, f"{row}: set evaluation.adapt_episodes={needed}"),
     )
+
+
+def why_not_together(curriculum: Curriculum) -> str | None:
+    """Return why seeds cannot learn a curriculum in one environment, if they cannot."""
+    kind = type(curriculum.examples[0]).__name__
+    if not are_graphs(curriculum.examples):
+        return f"the rows of {kind} cannot draw from the streams of several seeds, as those of CT-graphs can"
+    shared = any(block.switch is not None and block.switch.together for block in curriculum.example_blocks)
+    if isinstance(curriculum, Stream) and curriculum.blocks.seed is None:
+        return "each seed draws its own tasks: give curriculum.seed=0, and all learn one life"
+    if curriculum.protocol.guide_frames:
+        return "a guide draws from the generator of one seed"
+    return "its blocks change the tasks of all rows at once" if shared else None
 
 
 def notes(curriculum: Curriculum, agent: Agent) -> Iterator[str]:

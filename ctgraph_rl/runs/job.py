@@ -22,8 +22,7 @@ from ctgraph_rl.agent import Agent, MethodLike
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_int, plain, require, require_memory, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.disk import is_writable
-from ctgraph_rl.learn.refusals import check_share, notes
-from ctgraph_rl.learn.stacked import why_not_together
+from ctgraph_rl.learn.refusals import check_share, notes, why_not_together
 from ctgraph_rl.learn.unit_metrics import unit_rules
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CHECKPOINTS, CURRICULUM, LOG, METRICS

@@ -25,8 +25,6 @@ from ctgraph_rl.disk import append_line, make_folder, remove_empty, sync_folder,
 from ctgraph_rl.learn.collective import Member
 from ctgraph_rl.learn.loop import Alone, Group, Lockstep, run_loop
 from ctgraph_rl.learn.progress import ProgressBar
-from ctgraph_rl.learn.refusals import check_ids, check_rows
-from ctgraph_rl.learn.unit_metrics import unit_rules
 from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, FAILURE, LOG, METRICS, Locks
@@ -243,10 +241,6 @@ class OneBatch(SessionCoupling):
     def resume(self, members: Sequence[RunMember]) -> Sequence[RunState | None]:
         curriculum = members[0].curriculum
         agent = members[0].agent
-        check_rows(curriculum, agent.num_envs)
-        check_ids(curriculum, agent)
-        if members[0].log_units is not False:
-            require(*unit_rules(curriculum, agent, members[0].log_units))
         for each in members:
             each.checkpoints.tidy()
         begun = [each for each in members if each.checkpoints.files()]

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.architecture import PACKAGES
+from helpers.learning import learn_together
 from helpers.oracles import scripts
 from helpers.paths import CHECKOUT
 from helpers.scripted import ONE, TWO, lines
@@ -39,7 +40,6 @@ from ctgraph_rl import (
 from ctgraph_rl.batch.gym_env import GymEnv
 from ctgraph_rl.gym import CTGraphGymEnv, CTGraphVectorEnv
 from ctgraph_rl.learn.collective import Member, learn_collective
-from ctgraph_rl.learn.stacked import learn_together
 from ctgraph_rl.policies import SearchPolicy
 from ctgraph_rl.runs.config import target
 from ctgraph_rl.runs.job import run_job

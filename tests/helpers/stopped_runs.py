@@ -20,8 +20,9 @@ from baselines.a2c import A2C
 from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, learn_curriculum
 from ctgraph_rl.packages import conf_dir
 from ctgraph_rl.runs.checkpoints import Checkpoints, decoded, encoded
-from ctgraph_rl.runs.train import new_agent, train
+from ctgraph_rl.runs.train import new_agent
 from helpers.kill_runs import equal
+from helpers.learning import train
 from helpers.scripted import ONE, TWO
 
 SETTINGS = {

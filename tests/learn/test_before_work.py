@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.learning import train
 
 from baselines.dqn import DQN
 from baselines.ppo import PPO
@@ -33,7 +34,7 @@ from ctgraph_rl.log.scores import scores
 from ctgraph_rl.policies import OptimalPolicy
 from ctgraph_rl.runs import job
 from ctgraph_rl.runs.read import find_runs
-from ctgraph_rl.runs.train import new_agent, train
+from ctgraph_rl.runs.train import new_agent
 from ctgraph_rl.tasks.configurations import ct_su_b1
 
 TASKS = ct_su_b1((1, 1)), ct_su_b1((1, 2))
@@ -56,46 +57,6 @@ def dqn(**changes):
     return partial(DQN, **{**SIZES, **REPLAY, **EXPLORATION, **DOUBLE, **changes})
 
 
-def test_train_writes_results_with_its_defaults_into_a_directory_given_as_text(tmp_path):
-    train(CURRICULUM, new_agent(CURRICULUM, ppo(), 3), str(tmp_path), 3)
-
-    assert RunLog.read(tmp_path / LOG).measurements[0]["config"] == {"seed": 3}
-    runs, problems = find_runs([tmp_path])
-    assert ([run.seed for run in runs], problems) == ([3], [])
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"agent": ppo()}, "is no agent.*new_agent"),
-        ({"agent": PPO}, "PPO is no agent.*new_agent"),
-        ({"curriculum": None}, "curriculum must be a Curriculum, got None"),
-        ({"seed": "0"}, r"seed must be an integer in \[0, 2\*\*63\), got '0'"),
-        ({"seed": -1}, "seed must be an integer"),
-        ({"run_dir": "missing"}, "run_dir must be an existing directory, got"),
-        ({"run_dir": "x" * 300}, "run_dir must have at most 4095 bytes, 255 in each part; got"),
-        ({"run_dir": "a\0b"}, "run_dir must have no null character"),
-        ({"device": "meta"}, "device must be one of cpu.*got 'meta'"),
-        ({"config": {"a": {1}}}, "config must be plain JSON"),
-        ({"experts": []}, r"experts must be the Expert of each of \d tasks, or None, got \[\]"),
-        ({"experts": [1]}, r"experts must be the Expert of each of .* got \[1\]"),
-        ({"checkpoints": "here"}, r"checkpoints must be Checkpoints\(folder\), or None, got 'here'"),
-        ({"listeners": print}, "listeners must be a list of functions"),
-        ({"console": "x"}, "console must be a rich.console.Console, or None, got 'x'"),
-        ({"curriculum": replace(CURRICULUM, blocks=(Block(TASKS[0], 15),))}, "num_frames=15 of block 1"),
-    ],
-    ids=lambda value: str(value)[:40],
-)
-def test_train_refuses_what_it_cannot_use_before_it_writes(tmp_path, change, message):
-    given = {"curriculum": CURRICULUM, "agent": new_agent(CURRICULUM, ppo(), 0), "run_dir": ".", "seed": 0} | change
-    given["run_dir"] = tmp_path / given["run_dir"]
-
-    with pytest.raises(ValueError, match=message):
-        train(**given)
-
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -103,7 +64,11 @@ def test_train_refuses_what_it_cannot_use_before_it_writes(tmp_path, change, mes
         ((CURRICULUM, None, 0), "make_agent must be a function of two specs.*got None"),
         ((CURRICULUM, ppo(), -1), "seed must be an integer"),
         ((CURRICULUM, ppo(), 0, "cuda:99"), "device must be one of"),
-        ((None, ppo(), 0), "curriculum must be a Curriculum"),
+        ((None, ppo(), 0), "curriculum must be a Curriculum, got None"),
+        ((CURRICULUM, ppo(), "0"), r"seed must be an integer in \[0, 2\*\*63\), got '0'"),
+        ((CURRICULUM, lambda *specs: PPO, 0), "PPO is no agent, it lacks num_envs, .*new_agent"),
+        ((CURRICULUM, lambda *specs: ppo(), 0), "partial is no agent.*new_agent"),
+        ((replace(CURRICULUM, blocks=(Block(TASKS[0], 15),)), ppo(), 0), "num_frames=15 of block 1"),
     ],
     ids=lambda value: str(value)[:40],
 )

@@ -12,7 +12,7 @@ import curricula
 from ctgraph_rl import CTGraphEnv, RunLog, learn_curriculum
 from ctgraph_rl.learn.collect import collect
 from ctgraph_rl.learn.guide import Guide, guided_share
-from ctgraph_rl.learn.stacked import why_not_together
+from ctgraph_rl.learn.refusals import why_not_together
 from ctgraph_rl.policies import RandomPolicy
 from ctgraph_rl.tasks.protocol import Protocol
 from curricula.paper import ct_su_b1

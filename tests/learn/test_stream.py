@@ -11,6 +11,7 @@ from unittest.mock import patch
 
 import pytest
 import torch
+from helpers.learning import train
 from helpers.scripted import Scripted
 from helpers.stopped_runs import logs_of_equal_ends, make_agent
 from rich.console import Console
@@ -24,15 +25,14 @@ from baselines.methods.mask_sc import MaskSC
 from baselines.methods.packnet import PackNet
 from baselines.methods.scratch import Scratch
 from ctgraph_rl import Recorder, RunLog, learn_curriculum
-from ctgraph_rl.learn.refusals import notes
-from ctgraph_rl.learn.stacked import why_not_together
+from ctgraph_rl.learn.refusals import notes, why_not_together
 from ctgraph_rl.log.life_curves import by_windows
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.report.terminal import print_summary
 from ctgraph_rl.runs.config import composed
 from ctgraph_rl.runs.job import build, curriculum_of
 from ctgraph_rl.runs.read import read_run
-from ctgraph_rl.runs.train import new_agent, train
+from ctgraph_rl.runs.train import new_agent
 from ctgraph_rl.tasks.gain import optimal_gain, reached_by_policies
 from ctgraph_rl.tasks.life import Life
 

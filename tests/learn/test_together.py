@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 from helpers.kill_runs import equal
+from helpers.learning import learn_together
 from helpers.scripted import ONE, THREE, TWO, ScriptedGroup, Told, decide, first_training, lines, of
 from helpers.small_agents import BATCHED, MINIBATCHES, TINY, others_slow, saved_and_loaded
 
@@ -23,7 +24,7 @@ from baselines.update.seeds import SeedGroup
 from baselines.update.stack import Stack
 from baselines.update.update import losses_of, total_loss, transform_gradients, unstacked, update, with_tensors
 from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, learn_curriculum
-from ctgraph_rl.learn.stacked import learn_together, why_not_together
+from ctgraph_rl.learn.refusals import why_not_together
 from ctgraph_rl.runs.config import target
 from ctgraph_rl.runs.train import new_agent, with_method
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode

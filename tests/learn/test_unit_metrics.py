@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from helpers.learning import learn_together, train
 from torch import Tensor
 
 import curricula
@@ -20,7 +21,6 @@ from ctgraph_rl import Block, Curriculum, Evaluation
 from ctgraph_rl.learn.collect import agent_specs
 from ctgraph_rl.learn.collective import Member, learn_collective
 from ctgraph_rl.learn.lifelong import learn_curriculum
-from ctgraph_rl.learn.stacked import learn_together
 from ctgraph_rl.learn.unit_metrics import (
     NUM_FRESH,
     UnitMeter,
@@ -31,7 +31,7 @@ from ctgraph_rl.learn.unit_metrics import (
 )
 from ctgraph_rl.log.measurement import without_time
 from ctgraph_rl.log.run_log import RunLog
-from ctgraph_rl.runs.train import train
+from ctgraph_rl.runs import job
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_su_b1
 from ctgraph_rl.tasks.images import OneHot
 
@@ -291,9 +291,9 @@ def test_runs_seeds_together_and_collectives_measure_units_as_one_agent_alone(tm
     assert [units_of(member.log) for member in members] == [units, []]
 
 
-def test_a_run_that_cannot_measure_units_is_refused_before_it_is_begun(tmp_path):
-    with pytest.raises(ValueError, match="log_units must be True, False or 'batch', got 'block'"):
-        train(SHORT, learner(), tmp_path, 0, log_units="block")
+def test_a_run_that_cannot_measure_units_is_refused_before_it_is_begun(tmp_path, compose):
+    with pytest.raises(ValueError, match="log_units needs CT-graphs, whose images are known, got GymTask"):
+        job.run_job(compose("curriculum=frozen_lake_4maps", "log_units=true"), tmp_path)
     with pytest.raises(ValueError, match="log_units must be True, False or 'batch', got 0"):
         learn_curriculum(SHORT, learner(), log_units=0)
 

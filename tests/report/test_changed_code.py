@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from helpers.learning import train
 from helpers.made_runs import all_runs
 from helpers.small_agents import SMALL_AGENT
 from helpers.sweeping import command_line, sweep
@@ -20,7 +21,7 @@ from ctgraph_rl.report import page, results
 from ctgraph_rl.report.terminal import code_notes, mixed_code
 from ctgraph_rl.runs import config, job
 from ctgraph_rl.runs.read import grouped
-from ctgraph_rl.runs.train import new_agent, train
+from ctgraph_rl.runs.train import new_agent
 
 AGENT = """
 from baselines.reinforce import Reinforce

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.kill_runs import equal
+from helpers.learning import train
 from helpers.scripted import ONE, TWO
 from helpers.small_agents import TINY, others_slow
 from helpers.stopped_runs import LEARNED, OWN, SETTINGS, bombs, learn_into, make_agent, stopped_run
@@ -26,7 +27,7 @@ from ctgraph_rl.packages import conf_dir
 from ctgraph_rl.runs.checkpoints import Checkpoints
 from ctgraph_rl.runs.load import load
 from ctgraph_rl.runs.read import read_run
-from ctgraph_rl.runs.train import new_agent, train, with_method
+from ctgraph_rl.runs.train import new_agent, with_method
 
 METHODS = sorted(path.stem for path in Path(conf_dir(), "method").glob("*.yaml"))
 

@@ -12,12 +12,13 @@ from pathlib import Path
 
 import pytest
 from helpers.kill_runs import differences
+from helpers.learning import train
 from helpers.stopped_runs import LEARNED, Stopped, StopsAfter, flip_bit, learn_into, make_agent, stopped_run
 
 from ctgraph_rl import Block, RunLog
 from ctgraph_rl.log.provenance import provenance
 from ctgraph_rl.runs.checkpoints import Checkpoints
-from ctgraph_rl.runs.train import new_agent, train
+from ctgraph_rl.runs.train import new_agent
 from ctgraph_rl.tasks.curriculum import Evaluation
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 from helpers.kill_runs import equal
+from helpers.learning import learn_together
 from helpers.scripted import ONE, THREE, lines, of
 from helpers.small_agents import TINY, others_slow, saved_and_loaded
 from helpers.sweeping import sweep
@@ -22,7 +23,6 @@ from ctgraph_rl.core import philox
 from ctgraph_rl.learn import collect, exact
 from ctgraph_rl.learn.evaluate import Evaluator
 from ctgraph_rl.learn.loop import evaluate_members
-from ctgraph_rl.learn.stacked import learn_together
 from ctgraph_rl.runs import checkpoints, job
 from ctgraph_rl.runs import session as runs_session
 from ctgraph_rl.runs.config import target

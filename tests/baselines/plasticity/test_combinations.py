@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.learning import learn_together
 from helpers.plastic import equal, minibatch_of, plastic, weights_of
 from helpers.scripted import ONE, TWO, of
 from helpers.small_agents import CURRICULUM, SETTINGS, TINY, less, made, names_in, others_slow, small
@@ -20,7 +21,6 @@ from baselines.plasticity.shrink_and_perturb import ShrinkAndPerturb
 from baselines.update.seeds import SeedGroup
 from ctgraph_rl import Block, Evaluation, Protocol, RunLog, learn_curriculum
 from ctgraph_rl.learn.collect import agent_specs
-from ctgraph_rl.learn.stacked import learn_together
 from ctgraph_rl.runs import config
 from ctgraph_rl.runs.job import make_agent
 from ctgraph_rl.runs.read import read_run
