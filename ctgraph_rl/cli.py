@@ -32,9 +32,7 @@ COMMANDS = {
     "run": Command(RUN, "train an agent on a curriculum (default command)"),
     "agents": Command("baselines.__main__", "list the agents"),
     "board": Command("ctgraph_rl.board.standings.board_page", "make a page with tables of submissions"),
-    "collectives": Command(
-        "ctgraph_rl.collective.__main__", "make a page of figures and tables of learners that share"
-    ),
+    "collectives": Command("ctgraph_rl.collective.report", "make a page of figures and tables of learners that share"),
     "compare": Command("ctgraph_rl.compare", "say whether two runs are equal, bit for bit; report compares agents"),
     "curricula": Command("curricula.__main__", "list the curricula, or describe one"),
     "draw": Command("ctgraph_rl.play.pictures", "draw a task, and what a policy does there"),
@@ -42,7 +40,7 @@ COMMANDS = {
     "methods": Command("baselines.methods.__main__", "list the lifelong-learning methods"),
     "play": Command("ctgraph_rl.play.game", "play a CT-graph, or watch a policy play it"),
     "profile": Command("ctgraph_rl.profile.__main__", "score an agent on ten learning properties"),
-    "report": Command("ctgraph_rl.report.__main__", "make a page of figures and tables of runs"),
+    "report": Command("ctgraph_rl.report.page", "make a page of figures and tables of runs"),
     "results": Command("ctgraph_rl.report.results", "print a table of runs over seeds"),
     "submit": Command("ctgraph_rl.board.submit", "make a submission of runs, a folder that others can check"),
     "verify": Command("ctgraph_rl.board.verify", "check a submission by its files, reruns and held-out seeds"),

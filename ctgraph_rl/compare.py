@@ -12,10 +12,9 @@ import torch
 
 from ctgraph_rl import parsers
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_real, positive, require
-from ctgraph_rl.log.escape import listed, terminal_lines, terminal_text
+from ctgraph_rl.log.escape import listed, refused_by, terminal_lines, terminal_text
 from ctgraph_rl.log.files import AGENT, LOG, no_run
 from ctgraph_rl.log.measurement import without_time
-from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.saved import read_content, read_plain, view_bits
 from ctgraph_rl.parsers import BOUND

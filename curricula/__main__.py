@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from ctgraph_rl.log.refuse import refused_by
+from ctgraph_rl.log.escape import refused_by
 from ctgraph_rl.log.sheets import FORMATS, LISTED, Sheet, show, with_numbers
 from ctgraph_rl.parsers import OneLineParser
 from curricula import listed

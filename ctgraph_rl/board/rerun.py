@@ -154,22 +154,18 @@ def result_of(cell: RerunCell, seed: int, outcome: Outcome) -> Rerun:
         for name in ("", LOG, AGENT, METRICS, FAILURE):
             require_no_link(run_dir / name)
         if not (run_dir / METRICS).is_file():
-            return _failed(run_dir, outcome)
+            with suppress(OSError, ValueError):
+                reason = read_text(run_dir / FAILURE, MOST_BYTES_OF_A_REASON).strip()
+                alone = outcome.stopped is None and not reason.startswith(NOT_OF_THE_RUN)
+                return Rerun(None, None, reason, failed_alone=alone)
+            return Rerun(None, None, outcome.failure or f"it left no {METRICS}")
         log = RunLog.read(run_dir / LOG)
-        has_agent = (run_dir / AGENT).exists()
-        state = read_plain(read_content(run_dir / AGENT)) if has_agent else None
-        agent, size = (sum_of_state(state), count_bytes(state)) if has_agent else (None, None)
-        return Rerun(log, agent, None, size)
+        if not (run_dir / AGENT).exists():
+            return Rerun(log, None, None)
+        state = read_plain(read_content(run_dir / AGENT))
+        return Rerun(log, sum_of_state(state), None, count_bytes(state))
     except (ValueError, OSError) as error:
         return Rerun(None, None, str(error))
-
-
-def _failed(run_dir: Path, outcome: Outcome) -> Rerun:
-    with suppress(OSError, ValueError):
-        reason = read_text(run_dir / FAILURE, MOST_BYTES_OF_A_REASON).strip()
-        alone = outcome.stopped is None and not reason.startswith(NOT_OF_THE_RUN)
-        return Rerun(None, None, reason, failed_alone=alone)
-    return Rerun(None, None, outcome.failure or f"it left no {METRICS}")
 
 
 def why_other_bits(submission: Submission, runs: Sequence[SubmittedRun]) -> list[str]:

@@ -29,10 +29,9 @@ from ctgraph_rl.board.tracks import Track, track
 from ctgraph_rl.checks import ReadOnlyValues, Rule, repeated, require
 from ctgraph_rl.disk import make_folder, new_folder, require_new, write_whole
 from ctgraph_rl.log.damage import damaged
-from ctgraph_rl.log.escape import listed, terminal_text
+from ctgraph_rl.log.escape import listed, refused_by, terminal_text
 from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG, locked_new
 from ctgraph_rl.log.provenance import NUMBERS, code_changes
-from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.saved import count_bytes, read_content, read_plain, sum_of_state
 from ctgraph_rl.log.sources import SCRIPTS, find_sources

@@ -31,10 +31,9 @@ from ctgraph_rl.board.two_samples import runs_needed
 from ctgraph_rl.board.verification import SCHEMA, level_of, verification_of
 from ctgraph_rl.checks import NamedValues, Rule, is_int, is_real, require
 from ctgraph_rl.disk import make_folder, write_whole
-from ctgraph_rl.log.escape import terminal_lines, terminal_text
+from ctgraph_rl.log.escape import refused_by, terminal_lines, terminal_text
 from ctgraph_rl.log.files import locked
 from ctgraph_rl.log.provenance import is_ours, machine, targets, versions
-from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.packages import check_packages
 from ctgraph_rl.parsers import LEVELS, LIMIT_TIMES
 from ctgraph_rl.portable import cpu_model

@@ -20,7 +20,7 @@ from ctgraph_rl.learn.collective import ExchangeLike, learn_collective
 from ctgraph_rl.learn.progress import ProgressBar
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CHECKPOINTS, METRICS, member_folder
-from ctgraph_rl.log.provenance import code_changes, versions
+from ctgraph_rl.log.provenance import versions
 from ctgraph_rl.log.run_log import SCHEMA, RunLog
 from ctgraph_rl.runs import config
 from ctgraph_rl.runs.checkpoints import Checkpoints, RunState
@@ -29,10 +29,9 @@ from ctgraph_rl.runs.job import (
     ConfigAndPath,
     build,
     checkpoints_of,
-    code_of,
     console_of_runs,
-    first_line,
     is_finished,
+    is_replaced,
     prepare,
     train_experts,
 )
@@ -78,13 +77,19 @@ def run_collective(cfg: Any, run_dir: Path) -> None:
 
 def _learn(session: Session, cfg: Any, cells: Sequence[ConfigAndPath], exchange: ExchangeLike, run_dir: Path) -> None:
     with Interrupt() as interrupt, mark_failure(run_dir):
-        members = _members(cells, interrupt)
+        members = []
+        for number, (each, folder) in enumerate(cells):
+            try:
+                members.append(build(each, folder, interrupt))
+            except ValueError as error:
+                agent = f"curriculum.agent={each.curriculum.agent}, " if "agent" in each.curriculum else ""
+                raise ValueError(f"member {number} ({agent}seed={each.seed}): {error}") from error
         listed = "a collective's tables list tasks, which a stream draws one by one: take Stream.first(n)"
         require((not any(isinstance(member.curriculum, Stream) for member in members), listed))
         _warn_of_long_ids([member.curriculum for member in members])
         exchange.connect([member.agent for member in members])
         checkpoints = checkpoints_of(cfg, run_dir, interrupt)
-        if _is_replaced(cfg, cells):
+        if any(is_replaced(cfg, member) for member in members):
             checkpoints.clear()
         for member in members:
             session.lock(member.run_dir)
@@ -168,21 +173,3 @@ def _warn_of_long_ids(curricula: Sequence[Curriculum]) -> None:
             "to learners without observations of them",
             file=sys.stderr,
         )
-
-
-def _members(cells: Sequence[ConfigAndPath], interrupt: Interrupt) -> list[RunMember]:
-    members = []
-    for number, (cfg, folder) in enumerate(cells):
-        try:
-            members.append(build(cfg, folder, interrupt))
-        except ValueError as error:
-            agent = f"curriculum.agent={cfg.curriculum.agent}, " if "agent" in cfg.curriculum else ""
-            raise ValueError(f"member {number} ({agent}seed={cfg.seed}): {error}") from error
-    return members
-
-
-def _is_replaced(cfg: Any, cells: Sequence[ConfigAndPath]) -> bool:
-    if cfg.overwrite != config.STALE:
-        return bool(cfg.overwrite)
-    begun = [(first_line(folder), code_of(each, {})) for each, folder in cells]
-    return any(about is not None and code_changes(about, now) for about, now in begun)

@@ -1,4 +1,4 @@
-"""A page on collectives: learning times, returns and messages, figures, and tidy tables."""
+"""The command ``ctgraph-rl collectives``: a page on runs with ``exchange=NAME``, its figures, and tidy tables."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from ctgraph_rl import parsers
 from ctgraph_rl.checks import require
 from ctgraph_rl.collective.summary import COLLECTIVE, RUN, WHAT, Collective, read_collective, tables
 from ctgraph_rl.disk import make_folder, write_whole
-from ctgraph_rl.log.escape import csv_text, markdown_table, markdown_text
+from ctgraph_rl.log.escape import csv_text, markdown_table, markdown_text, refused_by, terminal_text
 from ctgraph_rl.log.files import METRICS, locked
 from ctgraph_rl.metrics.record import MASTERED
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, Gallery
@@ -147,3 +148,16 @@ def _draw_times(found: Sequence[Collective]) -> Any:
     axes.xaxis.get_major_locator().set_params(integer=True)
     axes.legend()
     return figure
+
+
+def main() -> None:
+    """Write the page."""
+    parser = parsers.collectives()
+    arguments = parser.parse_args()
+    with refused_by(parser):
+        page = write_report(arguments.runs, arguments.out)
+    print(f"report: {terminal_text(page)}")
+
+
+if __name__ == "__main__":
+    main()

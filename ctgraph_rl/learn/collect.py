@@ -158,7 +158,9 @@ def batches(
     """Yield the batches of `collect` and the data ``carried`` into the next step; ``done`` frames resume from it."""
     start = make_start(env, initial_state)
     data = dict((env.reset().update(start) if carried is None else carried).items(True, True))
-    act_once = CapturedAct(env, policy, start) if _is_captured(env, policy) else partial(act, env, policy, start=start)
+    is_known = type(env) is CTGraphEnv and not env.hides_episodes
+    is_captured = is_known and getattr(policy, "capturable", False) and captures(env.device)
+    act_once = CapturedAct(env, policy, start) if is_captured else partial(act, env, policy, start=start)
     unstored = [key for key in start if key.startswith(UNSTORED)]
     num_rows = env.numel()
     for first in range(done, num_frames, num_rows * num_steps):
@@ -193,22 +195,12 @@ def act(env: EnvBase, policy: Policy, data: Step, start: Step) -> tuple[Step, St
 
 def acted(policy: Policy, data: Step, device: torch.device | None) -> Step:
     """Return the data of some rows with what a policy writes, as `act`."""
-    if _acts_on_tensors(policy):
+    hooked = isinstance(policy, nn.Module) and (
+        policy._forward_hooks or policy._forward_pre_hooks or policy._compiled_call_impl
+    )
+    if "act_on_tensors" in vars(type(policy)) and not hooked:
         return data | policy.act_on_tensors(data)  # type: ignore[attr-defined]
     return dict(policy(TensorDict(data, [len(data["observation"])], device=device)).items(True, True))
-
-
-def _acts_on_tensors(policy: Policy) -> bool:
-    if "act_on_tensors" not in vars(type(policy)):
-        return False
-    if not isinstance(policy, nn.Module):
-        return True
-    return not (policy._forward_hooks or policy._forward_pre_hooks or policy._compiled_call_impl)
-
-
-def _is_captured(env: EnvBase, policy: Policy) -> bool:
-    is_known = type(env) is CTGraphEnv and not env.hides_episodes
-    return is_known and getattr(policy, "capturable", False) and captures(env.device)
 
 
 class CapturedAct:

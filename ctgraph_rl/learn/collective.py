@@ -296,7 +296,11 @@ class _Collective:
             if self.learners[number].is_done:
                 continue
             for given in self.exchange.receive(number, messages):
-                self._log_help(given)
+                frames = self.learners[given.receiver].steps.frames
+                place = {"block": self.members[given.receiver].curriculum.block_at(frames), "frames": frames}
+                values = {"sender": given.sender, **given.values}
+                self.members[given.receiver].log.append("help", **place, **values)
+                self.log.append("help", round=self.rounds, **place, receiver=given.receiver, **values)
         for kind in sorted({of for of, _ in self.mail.counts}):
             counts = {what: self.mail.counts[kind, what] for what in (SENT, DELIVERED, DROPPED, DELAYED)}
             self.log.append(
@@ -307,15 +311,6 @@ class _Collective:
                 **counts,
                 bytes=self.mail.bytes[kind],
             )
-
-    def _log_help(self, given: Help) -> None:
-        values = {"sender": given.sender, **given.values}
-        self.members[given.receiver].log.append("help", **self._place(given.receiver), **values)
-        self.log.append("help", round=self.rounds, **self._place(given.receiver), receiver=given.receiver, **values)
-
-    def _place(self, number: int) -> dict[str, int]:
-        frames = self.learners[number].steps.frames
-        return {"block": self.members[number].curriculum.block_at(frames), "frames": frames}
 
     def state(self) -> NamedValues:
         return {

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,7 @@ def damaged(run_dir: Path) -> list[str]:
     except (OSError, ValueError):
         return [METRICS]
     if sums is None:
-        return [name for name, check in _CHECKS.items() if not _is_readable(run_dir / name, check)]
+        return [name for name in (LOG, CURRICULUM, AGENT) if not _is_readable(run_dir / name)]
     found = []
     for name, stored in sums.items():
         path = run_dir / name
@@ -37,21 +36,18 @@ def damaged(run_dir: Path) -> list[str]:
     return found
 
 
-def _is_log(path: Path) -> bool:
-    log = RunLog.read(path)
-    return bool(log.of_kind("run")) and not log.torn_lines
-
-
-def _is_json(path: Path) -> bool:
-    return isinstance(json_value(read_regular(path, MOST_BYTES)), dict)
-
-
-_CHECKS: dict[str, Callable[[Path], bool]] = {LOG: _is_log, CURRICULUM: _is_json, AGENT: zipfile.is_zipfile}
-
-
-def _is_readable(path: Path, check: Callable[[Path], bool]) -> bool:
+def _is_readable(path: Path) -> bool:
+    if not path.exists():
+        return path.name != LOG
     try:
-        return path.is_file() and check(path) if path.exists() or path.name == LOG else True
+        if not path.is_file():
+            return False
+        if path.name == AGENT:
+            return zipfile.is_zipfile(path)
+        if path.name == CURRICULUM:
+            return isinstance(json_value(read_regular(path, MOST_BYTES)), dict)
+        log = RunLog.read(path)
+        return bool(log.of_kind("run")) and not log.torn_lines
     except (OSError, ValueError, RecursionError):
         return False
 

@@ -7,12 +7,16 @@ Python, ``\x1b``.
 
 from __future__ import annotations
 
+import argparse
 import csv
 import html
 import io
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
+
+from ctgraph_rl.disk import in_words
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r", "'")
 """Beginnings of a CSV cell that programs may take for a formula, and the mark."""
@@ -103,3 +107,14 @@ def _cell(value: Any) -> Any:
 def utf8_text(text: object) -> object:
     """Return a text that UTF-8 can hold, with halves of surrogate pairs as in Python; other values unchanged."""
     return text.encode("utf-8", "backslashreplace").decode() if isinstance(text, str) else text
+
+
+@contextmanager
+def refused_by(parser: argparse.ArgumentParser) -> Iterator[None]:
+    """Turn a user's error, but no broken pipe, into one message and exit code 2."""
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except (ValueError, OSError, ModuleNotFoundError) as error:
+        parser.exit(2, f"{parser.prog}: error: {terminal_lines(in_words(error))}\n")

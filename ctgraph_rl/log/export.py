@@ -15,8 +15,8 @@ from pathlib import Path
 from ctgraph_rl import parsers
 from ctgraph_rl.checks import require
 from ctgraph_rl.disk import write_whole
+from ctgraph_rl.log.escape import refused_by
 from ctgraph_rl.log.files import LOG, no_run
-from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.tables import write_tables
 from ctgraph_rl.metrics import Regime

@@ -159,7 +159,9 @@ def _measured(
     mastery: Curves | Undefined
     try:
         curves = protocol_curves(log, curriculum)
-        mastery = _mastery_curves(log, curriculum, curves)
+        shares = log.curves(curriculum.trained, "success_rate").performance
+        values = torch.where(_have_noise(curriculum.tasks), shares, curves.performance)
+        mastery = replace(curves, performance=values)
     except Undefined as reason:
         curves = reason
         mastery = reason
@@ -308,12 +310,6 @@ def _have_noise(tasks: Sequence[TaskLike]) -> Tensor:
     )
 
 
-def _mastery_curves(log: RunLog, curriculum: Curriculum, returns: Curves) -> Curves:
-    have_noise = _have_noise(curriculum.tasks)
-    shares = log.curves(curriculum.trained, "success_rate").performance
-    return replace(returns, performance=torch.where(have_noise, shares, returns.performance))
-
-
 def _known(value: Callable[[Task, float], float], task: Task) -> float:
     try:
         return value(task, 1.0)
@@ -417,15 +413,12 @@ def _areas(
         require((best_is_1, "the definition needs tasks whose optimal value is 1"))
         alone = [expert.curves([(0,)]) for expert in experts or ()]
         metrics.check_experts(curves, [curve.own_stage(0) for curve in alone])
-        _check_stages(curves, least=2 if trapezoids else 1)
+        least = 2 if trapezoids else 1
+        for task in range(curves.performance.shape[1]):
+            count = len(curves.own_stage(task))
+            needs = f"areas by trapezoids need {least} evaluations, task {task + 1} has {count} in its block"
+            require((count >= least, needs))
     except (ValueError, Undefined) as error:
         return dict.fromkeys((kind, f"expert_{kind}"), Undefined(str(error)))
     expert_areas = torch.cat([metrics.stage_areas(each, trapezoids) for each in alone])
     return {kind: metrics.stage_areas(curves, trapezoids), f"expert_{kind}": expert_areas}
-
-
-def _check_stages(curves: Curves, least: int) -> None:
-    for task in range(curves.performance.shape[1]):
-        count = len(curves.own_stage(task))
-        if count < least:
-            raise Undefined(f"areas by trapezoids need {least} evaluations, task {task + 1} has {count} in its block")

@@ -66,7 +66,9 @@ def find_sources(names: Iterable[str]) -> dict[str, str | None]:
             found |= _installed(package)
     while waiting:
         for name, spec in _specs(waiting.pop()):
-            if name not in found and _is_users(spec):
+            origin = spec.origin or ""
+            is_users = origin.endswith(".py") and not _is_installed(spec) and not origin.startswith(STANDARD)
+            if name not in found and is_users:
                 module = _module(name, spec)
                 found[name] = module.digest
                 waiting += module.imports
@@ -93,11 +95,6 @@ def _top(package: str) -> ModuleSpec | None:
         return find_spec(package)
     except (ValueError, ImportError):  # a module that was made by hand
         return None
-
-
-def _is_users(spec: ModuleSpec) -> bool:
-    origin = spec.origin or ""
-    return origin.endswith(".py") and not _is_installed(spec) and not origin.startswith(STANDARD)
 
 
 def _is_installed(spec: ModuleSpec) -> bool:

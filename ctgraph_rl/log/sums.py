@@ -33,20 +33,16 @@ def write_metrics(
     Args:
         of_windows: metrics whose terms are few, and kept as ``windows``.
     """
-    content = {name: _values(name, metric, of_windows) for name, metric in metrics.items()}
+    content = {}
+    for name, metric in metrics.items():
+        values = {**vars(metric), "n_seeds": 1, "interval": None}
+        terms = values.pop("terms")
+        content[name] = {**values, "windows": terms} if name in of_windows else values
     if sums is not None:
         files = {**sums, METRICS: _sum_of_metrics(content)}
         content = {FILES: {"run": uuid4().hex, **files}, **content}
     lines = [f"{json.dumps(name)}: {json.dumps(value)}" for name, value in content.items()]
     write_whole(path, "{\n" + ",\n".join(lines) + "\n}\n")
-
-
-def _values(name: str, metric: Any, of_windows: Collection[str]) -> NamedValues:
-    values = {**vars(metric), "n_seeds": 1, "interval": None}
-    terms = values.pop("terms")
-    if name in of_windows:
-        values["windows"] = terms
-    return values
 
 
 def _sum_of_metrics(content: ReadOnlyValues) -> NamedValues:

@@ -25,7 +25,7 @@ from ctgraph_rl.checks import at_least_one, is_real, require
 from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL, OUTCOME_OTHER_END
 from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.draw.layout import lay_out
-from ctgraph_rl.log.refuse import refused_by
+from ctgraph_rl.log.escape import refused_by
 from ctgraph_rl.play.arguments import select
 from ctgraph_rl.play.player import Player
 from ctgraph_rl.tasks.images import white_level

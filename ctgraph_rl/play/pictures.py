@@ -13,8 +13,7 @@ from ctgraph_rl.draw.dot import to_dot
 from ctgraph_rl.draw.image_figure import image_figure
 from ctgraph_rl.draw.style import save_figure
 from ctgraph_rl.draw.task_figure import task_figure
-from ctgraph_rl.log.escape import terminal_text
-from ctgraph_rl.log.refuse import refused_by
+from ctgraph_rl.log.escape import refused_by, terminal_text
 from ctgraph_rl.play.arguments import Selection, select
 from ctgraph_rl.play.gif import save_gif
 

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from ctgraph_rl import parsers, run
 from ctgraph_rl.checks import require
-from ctgraph_rl.log.escape import terminal_lines, terminal_text
-from ctgraph_rl.log.refuse import refused_by
+from ctgraph_rl.log.escape import refused_by, terminal_lines, terminal_text
 from ctgraph_rl.packages import import_agents
 from ctgraph_rl.profile.profile_page import text_table, write_profile
 from ctgraph_rl.report.style import require_packages

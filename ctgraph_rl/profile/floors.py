@@ -45,16 +45,14 @@ def counting_ceiling(task: Task) -> float:
     """
     rule = "the ceiling of counting is for a goal that pays 1 and no other reward"
     require(((task.goal_reward, task.fail_reward, task.step_reward) == (1, 0, 0), f"{rule}, got {task!r}"))
-    return 1.0 if task.observations.unique_decisions else decisions_by_step(task)[0]
-
-
-def decisions_by_step(task: Task) -> tuple[float, tuple[int, ...]]:
-    """Return such a policy's success where decision states share an image, and its decision at each step."""
-    return _best_by_step(task.graph.branching_factor, task.graph.wait_prob, task.goal_decisions)
+    if task.observations.unique_decisions:
+        return 1.0
+    return best_by_step(task.graph.branching_factor, task.graph.wait_prob, task.goal_decisions)[0]
 
 
 @cache
-def _best_by_step(branching_factor: int, wait_prob: float, goal: tuple[int, ...]) -> tuple[float, tuple[int, ...]]:
+def best_by_step(branching_factor: int, wait_prob: float, goal: tuple[int, ...]) -> tuple[float, tuple[int, ...]]:
+    """Return such a policy's success where decision states share an image, and its decision at each step."""
     source = random.Random(0)
     num_steps = 2 * len(goal) + 2
     if wait_prob:  # until almost no episode still waits for a decision

@@ -100,7 +100,12 @@ def latex(table: Table) -> str:
 
 
 def _tabular(table: Table, rows: TableRows, start: int, end: int) -> str:
-    heads = [latex_text(table.first), *map(_heading, table.head[start:end])]
+    heads = [latex_text(table.first)]
+    for name in table.head[start:end]:
+        wrapped = textwrap.wrap(name, HEADING, break_long_words=False, break_on_hyphens=False)
+        shown = r" \\ ".join(map(latex_text, wrapped))
+        is_long = len(wrapped) > 1
+        heads.append(rf"\begin{{tabular}}[b]{{@{{}}r@{{}}}}{shown}\end{{tabular}}" if is_long else shown)
     lines = [r"\sbox2{%", rf"\begin{{tabular}}{{@{{}}l{'r' * (len(heads) - 1)}@{{}}}}", r"\toprule"]
     lines += [" & ".join(heads) + r" \\", r"\midrule"]
     for name, cells in rows:
@@ -115,12 +120,6 @@ def _tabular(table: Table, rows: TableRows, start: int, end: int) -> str:
             lines.append(" & ".join(intervals) + r" \\")
     lines += [r"\bottomrule", r"\end{tabular}%", "}%"]
     return "\n".join([*lines, r"\ifdim\wd2>\linewidth\resizebox{\linewidth}{!}{\usebox2}\else\usebox2\fi"])
-
-
-def _heading(name: str) -> str:
-    lines = [latex_text(line) for line in textwrap.wrap(name, HEADING, break_long_words=False, break_on_hyphens=False)]
-    shown = r" \\ ".join(lines)
-    return shown if len(lines) < 2 else rf"\begin{{tabular}}[b]{{@{{}}r@{{}}}}{shown}\end{{tabular}}"
 
 
 def signed(value: str) -> str:

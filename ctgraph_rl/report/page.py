@@ -1,26 +1,33 @@
-"""The report: one self-contained HTML page, the same in Markdown, and tables in LaTeX."""
+"""The command ``ctgraph-rl report``: one self-contained HTML page, the same in Markdown, and tables in LaTeX."""
 
 from __future__ import annotations
 
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ctgraph_rl import __version__
+from ctgraph_rl import __version__, parsers
 from ctgraph_rl.checks import require
 from ctgraph_rl.disk import is_writable, make_folder, write_whole
-from ctgraph_rl.learn.progress import Count, silent
-from ctgraph_rl.log.files import locked
+from ctgraph_rl.learn.progress import Count, StepCounter, silent
+from ctgraph_rl.log.escape import refused_by, terminal_text
+from ctgraph_rl.log.files import METRICS, locked
 from ctgraph_rl.report import formats, results
 from ctgraph_rl.report.figures.adaptation import adaptation_curves
 from ctgraph_rl.report.figures.aggregates import improvements, profiles
-from ctgraph_rl.report.figures.experiments import experiments
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, Gallery, Written
 from ctgraph_rl.report.figures.heatmaps import MOST_NAMES, transfer_maps
 from ctgraph_rl.report.figures.labels import label_strips
-from ctgraph_rl.report.figures.learning_curves import learning_curves, mean_curves, training_curves, unit_curves
+from ctgraph_rl.report.figures.learning_curves import (
+    experiments,
+    learning_curves,
+    mean_curves,
+    training_curves,
+    unit_curves,
+)
 from ctgraph_rl.report.figures.life_windows import life_windows
 from ctgraph_rl.report.figures.trees import Trees, find_trees, task_trees
 from ctgraph_rl.report.latex import Table, as_cell, document
@@ -28,7 +35,7 @@ from ctgraph_rl.report.names import colours_of, displayed
 from ctgraph_rl.report.sections import Result, Section, sections
 from ctgraph_rl.report.style import MOST_AGENTS, require_packages, style
 from ctgraph_rl.report.templates import rendered
-from ctgraph_rl.report.terminal import code_notes, group_size, label_notes, mixed_code
+from ctgraph_rl.report.terminal import code_notes, group_size, label_notes, mixed_code, print_problems, print_summary
 from ctgraph_rl.runs.read import Problem, Run, find_runs, why_left_out
 from ctgraph_rl.runs.settings import flat
 
@@ -254,3 +261,31 @@ def _system(run: Run) -> str:
     machine = run.about.get("machine", "not said")
     group = f"; trained in a group of {group_size(run)} seeds" if group_size(run) > 1 else ""
     return f"{versions or 'versions not said'}; machine {machine}, threads of torch {threads}, device {device}{group}"
+
+
+def main() -> None:
+    """Write the report, and say what is in it; the exit code is 1 if runs were left out or have different code."""
+    parser = parsers.report()
+    arguments = parser.parse_args()
+    with refused_by(parser):
+        if len(arguments.runs) == 1 and (arguments.runs[0] / METRICS).is_file():
+            print_summary(arguments.runs[0])
+        with StepCounter() as count:
+            report = write_report(
+                arguments.runs,
+                arguments.out,
+                arguments.agent,
+                width=arguments.width,
+                colours=arguments.colour,
+                count=count,
+                tuning=arguments.tuning,
+            )
+    incomplete = print_problems(report.problems, report.runs)
+    num_runs = len(report.runs)
+    print(f"report of {num_runs} run{'s' * (num_runs != 1)}: {terminal_text(report.page)}")
+    if incomplete:
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -15,9 +15,8 @@ from ctgraph_rl import metrics, parsers
 from ctgraph_rl.checks import nearest, positive, require
 from ctgraph_rl.disk import write_named
 from ctgraph_rl.learn.progress import Count, StepCounter, silent
-from ctgraph_rl.log.escape import csv_text
+from ctgraph_rl.log.escape import csv_text, refused_by
 from ctgraph_rl.log.files import LOG
-from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.tables import check_table, write_evaluations
 from ctgraph_rl.report import statistics

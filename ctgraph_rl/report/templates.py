@@ -25,10 +25,7 @@ def rendered(template: Path, **values: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.finalize = _one_line if escapes else None
+    if escapes:
+        environment.finalize = lambda value: terminal_text(value) if type(value) is str else value
     environment.filters["line"] = markdown_text
     return environment.get_template(template.name).render(values)
-
-
-def _one_line(value: Any) -> Any:
-    return terminal_text(value) if type(value) is str else value

@@ -287,21 +287,14 @@ def target(cfg: DictConfig, group: str) -> Callable[..., Any]:
     """
     given = [str(key) for key in cfg[group] if not str(key).startswith("_")]
     check_arguments(group, given, hydra.utils.get_object(cfg[group]["_target_"]))
-    with _allowed_targets(cfg[group]):
+    allowed: AbstractContextManager[Any] = nullcontext()  # Hydra 1.3 refuses what it knows to do harm
+    if IS_NEXT_HYDRA:  # any package but Python's standard library, which has functions that do harm
+        packages = {name.partition(".")[0] for name in sys.modules}
+        packages |= set(_PACKAGE.findall(OmegaConf.to_yaml(cfg[group])))  # which may not be imported yet
+        allow = vars(hydra.utils)["execution_whitelist"]  # type checkers read Hydra 1.3
+        allowed = allow([f"{name}.*" for name in packages - sys.stdlib_module_names])
+    with allowed:
         return hydra.utils.instantiate(cfg[group], _partial_=True, _convert_="all")
-
-
-def _allowed_targets(group: DictConfig) -> AbstractContextManager[Any]:
-    """Let Hydra 1.4 call any package but Python's standard library, which has functions that do harm.
-
-    Args:
-        group: of the configuration; its targets' modules may not be imported yet.
-    """
-    if not IS_NEXT_HYDRA:
-        return nullcontext()  # it refuses what it knows to do harm
-    packages = {name.partition(".")[0] for name in sys.modules} | set(_PACKAGE.findall(OmegaConf.to_yaml(group)))
-    allowed: Callable[[list[str]], Any] = vars(hydra.utils)["execution_whitelist"]  # type checkers read Hydra 1.3
-    return allowed([f"{name}.*" for name in packages - sys.stdlib_module_names])
 
 
 def curriculum_of(name: str, config_dir: Path | None = None) -> Curriculum:

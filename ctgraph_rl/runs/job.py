@@ -142,10 +142,7 @@ def console_of_runs() -> Console | None:
 def prepare(session: Session, cfg: DictConfig, member: RunMember) -> None:
     """Open a run's tracker, remove replaced results, and write the configuration."""
     run_dir = member.run_dir
-    replaced = bool(cfg.overwrite)
-    if cfg.overwrite == config.STALE:
-        about = first_line(run_dir)
-        replaced = about is not None and bool(code_changes(about, member.about))
+    replaced = is_replaced(cfg, member)
     if "logger" in cfg:
         settings = dict(flat(member.config))
         member.listeners.append(session.enter(Tracker(config.target(cfg, "logger"), run_dir, settings)))
@@ -155,6 +152,14 @@ def prepare(session: Session, cfg: DictConfig, member: RunMember) -> None:
         member.checkpoints.clear()
         remove_results(run_dir)
     config.write_configuration(cfg, run_dir / ".hydra")
+
+
+def is_replaced(cfg: DictConfig, member: RunMember) -> bool:
+    """Return whether a run takes the place of what ``overwrite`` gives up in its directory."""
+    if cfg.overwrite != config.STALE:
+        return bool(cfg.overwrite)
+    about = first_line(member.run_dir)
+    return about is not None and bool(code_changes(about, member.about))
 
 
 def settings_of_experts(cfg: DictConfig) -> NamedValues:

@@ -281,7 +281,9 @@ def find_runs(
 
 
 def _tuning_notes(runs: Sequence[Run]) -> Iterator[Problem]:
-    for (name, agent, share), some in split_by(runs, _tuned).items():
+    for (name, agent, share), some in split_by(
+        runs, lambda run: (run.group[0], run.agent, tuning_share(run.about))
+    ).items():
         trials = len({run.alike for run in some})
         seeds = listed(sorted({run.seed for run in some}), MOST_SEEDS)
         runs_of = f"{len(some)} tuning run{'s' * (len(some) > 1)} of {agent} on {name}"
@@ -290,10 +292,6 @@ def _tuning_notes(runs: Sequence[Run]) -> Iterator[Problem]:
         ended = f", ended after {listed(sorted(ends), MOST_SEEDS)} frames" if ends else ""
         reason = f"{what}, objective_until={share:g}{ended}; --tuning, in Python tuning=True, shows them"
         yield Problem(some[0].path, reason, is_error=False)
-
-
-def _tuned(run: Run) -> tuple[str, str | None, float | None]:
-    return run.group[0], run.agent, tuning_share(run.about)
 
 
 def read_run(path: Path) -> Run:

@@ -124,13 +124,15 @@ class Recorder:
         checkpoint_seconds: float = SECONDS,
     ) -> None:
         about = plain(about)
+        listed = code is None or isinstance(code, (list, tuple))
+        is_code = listed and all(isinstance(each, (type, FunctionType)) for each in code or ())
         writes = run_dir is not None or not (overwrite or resume or logger is not None)
         require(
             (isinstance(curriculum, Curriculum), f"curriculum must be a Curriculum, got {curriculum!r}"),
             (is_int(seed, 0, 2**63 - 1), f"seed must be an integer in [0, 2**63), got {seed!r}"),
             ("seed" not in (about or {}), "about must leave out the seed, which is a separate argument"),
             (is_json_object(about), f"about must be plain JSON values by name, got {about!r}"),
-            (_is_code(code), f"code must be a list of classes and functions, such as [MyAgent], got {code!r}"),
+            (is_code, f"code must be a list of classes and functions, such as [MyAgent], got {code!r}"),
             *true_or_false(overwrite=overwrite, resume=resume),
             *not_negative(checkpoint_seconds=checkpoint_seconds),
             (
@@ -416,8 +418,3 @@ class Recorder:
             name = getattr(policy, "__name__", type(policy).__name__)
             require(*exact_rules(acts, curriculum.examples[0], {}, name))
         return acts
-
-
-def _is_code(code: object) -> bool:
-    listed = code is None or isinstance(code, (list, tuple))
-    return listed and all(isinstance(each, (type, FunctionType)) for each in code or ())  # type: ignore[attr-defined]

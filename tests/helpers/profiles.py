@@ -13,7 +13,7 @@ from ctgraph_rl import Curriculum, RunLog
 from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.learn.evaluate import Evaluator
 from ctgraph_rl.policies import NavigationPolicy, OptimalPolicy, RandomPolicy
-from ctgraph_rl.profile.floors import decisions_by_step
+from ctgraph_rl.profile.floors import best_by_step
 from ctgraph_rl.profile.properties import Evidence, Measured, measure
 from ctgraph_rl.profile.scoring import Score, score_of
 from curricula.profile import PROPERTIES
@@ -58,7 +58,7 @@ class ByStep(NavigationPolicy):
             if task.observations.unique_decisions:
                 decisions.append(0)
             else:
-                _, best = decisions_by_step(task)
+                _, best = best_by_step(task.graph.branching_factor, task.graph.wait_prob, task.goal_decisions)
                 decisions.append(best[min(step, len(best) - 1)])
         right = self._of_goal(tensordict)
         return torch.where(torch.tensor(decisions) == 0, right, torch.tensor(decisions))

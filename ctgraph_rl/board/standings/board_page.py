@@ -17,8 +17,7 @@ from ctgraph_rl.board.standings.entries import BoardEntry, read_entries, shown_l
 from ctgraph_rl.board.verification import STATES
 from ctgraph_rl.checks import require
 from ctgraph_rl.disk import make_folder, write_whole
-from ctgraph_rl.log.escape import terminal_text
-from ctgraph_rl.log.refuse import refused_by
+from ctgraph_rl.log.escape import refused_by, terminal_text
 from ctgraph_rl.report.style import require_packages
 from ctgraph_rl.report.templates import rendered
 from ctgraph_rl.runs.read import Problem, why_left_out

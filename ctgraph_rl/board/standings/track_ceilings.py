@@ -35,10 +35,13 @@ def ceilings_of(curriculum: Curriculum) -> Ceilings:
         return Ceilings(optimal, *[None] * (len(Ceilings._fields) - 1))
     changes = any(task.goal_change is not None for task in tasks)
     plain = all(map(_is_plain, tasks))
+    episodes = curriculum.evaluation.episodes_per_row
+    plays_all = {task.graph.num_end_states for task in tasks} == {episodes}
+    searches = plain and plays_all and all(task.goal_change == (episodes, episodes) for task in tasks)
     return Ceilings(
         optimal=_mean(tasks, lambda task: task.optimal_value(1.0)),
         one_policy=_one_policy(tasks, curriculum.protocol),
-        search=_search(tasks, curriculum.evaluation.episodes_per_row),
+        search=(episodes + 1) / (2 * episodes) if searches else None,
         memoryless=None if changes else _mean(tasks, memoryless_ceiling),
         open_loop=None if changes else _mean(tasks, open_loop_ceiling),
         random=_mean(tasks, lambda task: task.graph.reward_prob_random * task.goal_reward) if plain else None,
@@ -97,9 +100,3 @@ def _one_policy(tasks: Sequence[Task], protocol: Protocol) -> float | None:
         counts = Counter(goals)
         reached += max(sum(n for goal, n in counts.items() if path[: len(goal)] == goal) for path in counts)
     return reached / len(tasks) * tasks[0].goal_reward
-
-
-def _search(tasks: Sequence[Task], episodes: int) -> float | None:
-    ends = {task.graph.num_end_states for task in tasks}
-    whole = all(task.goal_change == (episodes, episodes) for task in tasks) and ends == {episodes}
-    return (episodes + 1) / (2 * episodes) if whole and all(map(_is_plain, tasks)) else None

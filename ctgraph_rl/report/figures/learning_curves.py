@@ -35,6 +35,8 @@ LabelPlaces = Sequence[tuple[float, float]]
 
 COLUMNS = 4
 
+MOST_EXPERIMENTS, EXPERIMENTS_BESIDE = 12, 3
+
 MARGIN = 0.03
 """Share of the frames that an axis shows beside them."""
 
@@ -142,6 +144,39 @@ def draw_means(axes: Any, section: Section, looks: Mapping[str, dict[str, Any]])
             seeds = list(filter(None, map(mean_curve, histories(result.finished))))
             points = over_seeds(seeds, result.bounds.of_returns)
             _draw(axes, looks[result.agent], [points], seeds if len(seeds) <= MOST_SEEDS else [])
+
+
+def experiments(found: Sequence[Section]) -> CaptionedFigure | None:
+    """Return the mean returns on several curricula; None for fewer than two with a finished run."""
+    measured = [section for section in found if section.finished]
+    if len(measured) < 2:
+        return None
+    agents = left_out(len(_agents_on(measured)), MOST_AGENTS, "agents")
+    cut = left_out(len(measured), MOST_EXPERIMENTS, "curricula") + agents
+    caption = (
+        "Mean return over all tasks of each curriculum at its evaluations, over the frames learned from. Lines: means "
+        f"over seeds; bands: {BANDS}; thin lines: single seeds. Dashed: ends of blocks.{cut}"
+    )
+    shown = measured[:MOST_EXPERIMENTS]
+    looks = {agent: agent_style(position, agent) for position, agent in enumerate(_agents_on(shown)[:MOST_AGENTS])}
+    grid = panels(len(shown), EXPERIMENTS_BESIDE, 1.7, sharey=True)
+    figure = grid[0, 0].figure
+    for axes, section in zip(grid.ravel(), shown, strict=False):
+        draw_means(axes, section, looks)
+        axes.set_title(short(section.name))
+        frames_axis(axes)
+    for row in grid:
+        row[0].set_ylabel("mean return")
+    figure.supxlabel("frames", fontsize=8)
+    agents_legend(figure, list(zip(map(short, looks), looks.values(), strict=True)))
+    return CaptionedFigure("experiments", "All experiments", caption, figure)
+
+
+def _agents_on(found: Sequence[Section]) -> list[str]:
+    agents: dict[str, None] = {}
+    for section in found:
+        agents |= dict.fromkeys(result.agent for result in section.results)
+    return list(agents)
 
 
 def _agents(section: Section) -> str:

@@ -17,9 +17,8 @@ from ctgraph_rl.report.figures.aggregates import (
     probability_of_improvement,
     profiles,
 )
-from ctgraph_rl.report.figures.experiments import experiments
 from ctgraph_rl.report.figures.gallery import Gallery
-from ctgraph_rl.report.figures.learning_curves import mean_curves
+from ctgraph_rl.report.figures.learning_curves import experiments, mean_curves
 from ctgraph_rl.report.sections import sections
 from ctgraph_rl.report.style import style
 

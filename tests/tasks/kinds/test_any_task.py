@@ -20,8 +20,8 @@ from ctgraph_rl.board.held_out import other_curriculum
 from ctgraph_rl.board.standings.track_ceilings import ceilings_of, in_words
 from ctgraph_rl.compare import main as compare
 from ctgraph_rl.policies import OptimalPolicy
-from ctgraph_rl.report.__main__ import main as report
 from ctgraph_rl.report.bounds_of_runs import bounds_of_curriculum
+from ctgraph_rl.report.page import main as report
 from ctgraph_rl.tasks.kinds.gym_task import GymTask
 from ctgraph_rl.tasks.switch import Drift
 
