@@ -80,7 +80,18 @@ def other_curriculum(curriculum: Curriculum, key: str) -> Curriculum:
     """
 
     def other(task: TaskLike) -> TaskLike:
-        return other_task(task, key) if isinstance(task, Task) else task
+        if not isinstance(task, Task):
+            return task
+        changed: dict[str, Any] = {"goal": renamed(task.goal, task.graph.branching_factor, key)}
+        if task.image_seed is not None:
+            seed = HELD_OUT_SEEDS[drawn(f"{key} images {task.image_seed}", len(HELD_OUT_SEEDS))]
+            changed["images"] = replace(task.images, seed=seed)  # type: ignore[type-var]
+        if task.swapped_branches is not None:
+            path, pair = task.swapped_branches
+            both = (renamed((*path, branch), task.graph.branching_factor, key) for branch in pair)
+            first, second = sorted(both)
+            changed["swapped_branches"] = (first[:-1], (first[-1], second[-1]))
+        return replace(task, **changed)
 
     blocks = []
     for block in curriculum.blocks:
@@ -89,20 +100,6 @@ def other_curriculum(curriculum: Curriculum, key: str) -> Curriculum:
     name = f"{curriculum.name} (held out)"
     source = f"{curriculum.source}; images and goals drawn by {key}"
     return replace(curriculum, name=name, source=source, blocks=tuple(blocks), evaluation=evaluation)
-
-
-def other_task(task: Task, key: str) -> Task:
-    """Return a task with other images and another goal, as in `other_curriculum`."""
-    changed: dict[str, Any] = {"goal": renamed(task.goal, task.graph.branching_factor, key)}
-    if task.image_seed is not None:
-        seed = HELD_OUT_SEEDS[drawn(f"{key} images {task.image_seed}", len(HELD_OUT_SEEDS))]
-        changed["images"] = replace(task.images, seed=seed)  # type: ignore[type-var]
-    if task.swapped_branches is not None:
-        path, pair = task.swapped_branches
-        both = (renamed((*path, branch), task.graph.branching_factor, key) for branch in pair)
-        first, second = sorted(both)
-        changed["swapped_branches"] = (first[:-1], (first[-1], second[-1]))
-    return replace(task, **changed)
 
 
 def renamed(path: tuple[int, ...], branching_factor: int, key: str) -> tuple[int, ...]:

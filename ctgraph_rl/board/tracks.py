@@ -127,10 +127,6 @@ class Track:
         """The curriculum of the first variant."""
         return self.variants[0].curriculum
 
-    def variant_of(self, curriculum: Curriculum) -> Variant | None:
-        """Return the variant with this curriculum, if any."""
-        return self.by_fingerprint.get(curriculum.fingerprint)
-
 
 def drawn(text: str, most: int) -> int:
     """Return an integer in [0, most) from a text: the first 8 bytes of its SHA-256 modulo ``most``."""

@@ -232,18 +232,6 @@ def write_verification(submission: Submission, checks: Sequence[Check], plan: Pl
     return path
 
 
-def check_stored(submission: Submission, level: str) -> None:
-    """Refuse to replace a verification of the same files by one of a lower level.
-
-    Raises:
-        ValueError: names the file and its level.
-    """
-    stored = verification_of(submission).level
-    path = submission.path / VERIFICATION
-    lower = f"{path} has the level {stored}, --level {level} would replace it: verify a copy of the folder"
-    require((stored not in LEVELS[LEVELS.index(level) + 1 :], lower))
-
-
 def report(submission: Submission, checks: Sequence[Check]) -> str:
     """Return in words what a verification found."""
     wrong = [check for check in checks if not check.passed]
@@ -259,8 +247,15 @@ def report(submission: Submission, checks: Sequence[Check]) -> str:
 
 
 def verify(submission: Submission, arguments: argparse.Namespace) -> list[Check]:
-    """Verify a submission to the level of the command line, say what will run, and write what was found."""
-    check_stored(submission, arguments.level)
+    """Verify a submission to the level of the command line, say what will run, and write what was found.
+
+    Raises:
+        ValueError: to replace a verification of the same files by one of a lower level.
+    """
+    stored = verification_of(submission).level
+    path = submission.path / VERIFICATION
+    lower = f"{path} has the level {stored}, --level {arguments.level} would replace it: verify a copy of the folder"
+    require((stored not in LEVELS[LEVELS.index(arguments.level) + 1 :], lower))
     checks = rescore(submission)
     if arguments.level == RESCORED or not all(check.passed for check in checks):
         write_verification(submission, checks)

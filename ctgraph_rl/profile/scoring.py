@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from ctgraph_rl.checks import ReadOnlyValues, require
+from ctgraph_rl.checks import require
 from ctgraph_rl.learn.evaluate import Evaluator
 from ctgraph_rl.log.files import CURRICULUM, LOG
 from ctgraph_rl.log.named_curricula import curriculum_named
@@ -183,7 +183,8 @@ def score_of_results(results: Results) -> Score:
 
 def profile_results(paths: Sequence[Path | str], agents: Sequence[str] = ()) -> dict[str, dict[str, Results]]:
     """Return what each agent's seeds measured, by the title of each property, as `profile_scores` reads it."""
-    properties = profile_properties()
+    check_packages()
+    properties = import_module("curricula.profile").PROPERTIES
     names = {*properties}
     for prop in properties.values():
         names.update(prop.controls)
@@ -306,13 +307,3 @@ def _agent_class(run: Run) -> Any:
     kind = getattr(sys.modules.get(module), name, None)
     is_agent = isinstance(kind, type) and kind.__module__ == module and all(hasattr(kind, each) for each in OF_AGENTS)
     return kind if is_agent else None
-
-
-def profile_properties() -> ReadOnlyValues:
-    """Return the properties of `curricula.profile` by their curricula.
-
-    Raises:
-        ValueError: as `check_packages`.
-    """
-    check_packages()
-    return import_module("curricula.profile").PROPERTIES

@@ -74,10 +74,6 @@ class Checkpoints:
         """`offer` the one state of a list."""
         self.offer(lambda: states()[0], at_block_end)
 
-    def is_due(self, at_block_end: bool) -> bool:
-        """Return whether it is time to save."""
-        return at_block_end or self._last is None or time.monotonic() - self._last >= self.seconds
-
     def save(self, state: RunState, is_like_others: bool = False) -> None:
         """Write a checkpoint, then remove the oldest, and broken ones later than the run.
 
@@ -160,7 +156,8 @@ def offer_all(checkpoints: Sequence[Checkpoints], states: Callable[[], Sequence[
     """`Checkpoints.offer` for runs that learn together: all are saved or none."""
     first = checkpoints[0]
     stop = first.interrupt.is_asked
-    if stop or first.is_due(at_block_end):
+    is_late = first._last is None or time.monotonic() - first._last >= first.seconds
+    if stop or at_block_end or is_late:
         for number, (each, state) in enumerate(zip(checkpoints, states(), strict=True)):
             each.save(state, is_like_others=number > 0)
     if stop:

@@ -52,7 +52,8 @@ _NO_SETTINGS = {"_target_", "hydra"}
 def explain(error: BaseException, cfg: DictConfig | None = None) -> str:
     """Return one message for a user's error: its cause within Hydra's errors, and the likely name."""
     cause = error
-    while cause.__cause__ is not None and not _says_what_to_do(cause):
+    told = (ValueError, OSError, ModuleNotFoundError)  # which say what to do, unless they are of OmegaConf
+    while cause.__cause__ is not None and (isinstance(cause, OmegaConfBaseException) or not isinstance(cause, told)):
         cause = cause.__cause__
     if isinstance(cause, OmegaConfBaseException):
         return _of_omegaconf(_first(cause), str(error).strip())
@@ -138,12 +139,6 @@ def _unknown_setting(asked: str, node: DictConfig) -> str:
 
 def _removed(key: str) -> str:
     return f"~{key} removes {key}, which every run needs: leave ~{key} out"
-
-
-def _says_what_to_do(error: BaseException) -> bool:
-    if isinstance(error, OmegaConfBaseException):
-        return False
-    return isinstance(error, (ValueError, OSError, ModuleNotFoundError))
 
 
 def _unresolved(cfg: DictConfig) -> NamedValues:

@@ -76,14 +76,10 @@ def run_cell(packed: tuple[str, list[str], bytes], wait: float) -> JobReturn:
             if not result.exists():
                 raise RuntimeError(f"the process of this cell ended with code {code}")
             returned: JobReturn = pickle.loads(result.read_bytes())
-        if not is_in_use(returned):
+        in_use = str(returned._return_value).startswith("BlockingIOError")
+        if returned.status != JobStatus.FAILED or not in_use:
             return returned
         time.sleep(wait)
-
-
-def is_in_use(returned: JobReturn) -> bool:
-    """Return whether another process runs the cell."""
-    return returned.status == JobStatus.FAILED and str(returned._return_value).startswith("BlockingIOError")
 
 
 if __name__ == "__main__":

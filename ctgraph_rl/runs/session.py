@@ -38,7 +38,6 @@ from ctgraph_rl.packages import check_packages
 from ctgraph_rl.runs import config
 from ctgraph_rl.runs.checkpoints import Checkpoints, RunState, newest_of_all, offer_all
 from ctgraph_rl.runs.explain import explain
-from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.curriculum_json import file_text
 
 if TYPE_CHECKING:
@@ -142,7 +141,8 @@ class RunMember(Member):
             torch.save(state if self.save_optimiser else without_moments(state), weights)
             write_whole(self.run_dir / AGENT, weights.getvalue())
         experts = None if self.experts is None else [expert.log for expert in self.experts]
-        write_results(self.log, self.curriculum, self.run_dir, experts)
+        metrics = scores(self.log, self.curriculum, experts)
+        write_metrics(self.run_dir / METRICS, metrics, sums_of(self.run_dir), OF_LIFE)
         self.checkpoints.clear()
 
 
@@ -350,11 +350,6 @@ def mark_failure(run_dir: Path) -> Iterator[None]:
             with suppress(OSError):
                 write_whole(mark, f"{type(error).__name__}: {explain(error)}\n", synced=False)
         raise
-
-
-def write_results(log: RunLog, curriculum: Curriculum, run_dir: Path, experts: Sequence[RunLog] | None = None) -> None:
-    """Write the metrics of a closed log, with the sums of all results."""
-    write_metrics(run_dir / METRICS, scores(log, curriculum, experts), sums_of(run_dir), OF_LIFE)
 
 
 def remove_results(run_dir: Path) -> None:

@@ -40,12 +40,13 @@ def test_the_variants_of_a_track_are_different_curricula_each_found_by_its_own(n
     assert len({each.curriculum.fingerprint for each in found.variants}) == len(found.variants)
     assert len({(each.rung, each.given) for each in found.variants}) == len(found.variants)
     assert len(found.variants) == len(found.rungs) * (1 + len(found.less_given))
-    assert all(found.variant_of(each.curriculum) is each for each in found.variants)
+    assert all(found.by_fingerprint[each.curriculum.fingerprint] is each for each in found.variants)
 
 
 def test_another_curriculum_is_no_variant():
-    assert TRACKS["small"].variant_of(curricula.load("fo_b1_4tasks")) is None
-    assert TRACKS["forgetting"].variant_of(curricula.load("ct8")) is TRACKS["forgetting"].variants[0]
+    assert curricula.load("fo_b1_4tasks").fingerprint not in TRACKS["small"].by_fingerprint
+    ct8 = curricula.load("ct8").fingerprint
+    assert TRACKS["forgetting"].by_fingerprint[ct8] is TRACKS["forgetting"].variants[0]
 
 
 def test_the_small_track_is_four_goals_given_with_ids_or_with_less():

@@ -23,7 +23,8 @@ from ctgraph_rl.board.rescore import Check
 from ctgraph_rl.board.submit import submit
 from ctgraph_rl.log.provenance import NUMBERS
 from ctgraph_rl.log.run_log import RunLog
-from ctgraph_rl.runs.session import write_results
+from ctgraph_rl.log.scores import scores
+from ctgraph_rl.log.sums import sums_of, write_metrics
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 ENTRY = """
@@ -124,7 +125,8 @@ def test_a_log_that_was_edited_with_all_that_follows_from_it_is_found_by_a_rerun
         log = RunLog.read(run_dir / "run.jsonl")
         lines = [{**m, "return_mean": 1.0} if m["kind"] == "evaluation" else m for m in log.measurements]
         (run_dir / "run.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-        write_results(RunLog.read(run_dir / "run.jsonl"), Curriculum.from_json(run_dir / "curriculum.json"), run_dir)
+        found = scores(RunLog.read(run_dir / "run.jsonl"), Curriculum.from_json(run_dir / "curriculum.json"))
+        write_metrics(run_dir / "metrics.json", found, sums_of(run_dir))
     folder = submitted(tmp_path, tiny_track, method, tmp_path / "submission")
 
     code, written = call(monkeypatch, tiny_home, folder, "--cells=1", "--yes")

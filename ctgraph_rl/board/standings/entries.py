@@ -123,8 +123,8 @@ def make_entry(submission: Submission) -> BoardEntry:
     name = submission.method["name"]
     require((track is not None, f"{name} is for no track: name one in method.yaml, or submit with --track"))
     assert track is not None
-    variant = track.variant_of(submission.curriculum)
     found = submission.curriculum.fingerprint
+    variant = track.by_fingerprint.get(found)
     own = replace(track, version=track_version(submission.method))
     other = "" if own.version == track.version else f"; it was submitted to {own.id}: use a package that has it"
     require(
