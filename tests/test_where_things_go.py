@@ -80,7 +80,7 @@ def test_a_metric_is_a_defined_function(monkeypatch):
 
 
 def widest(values: list[float]) -> Estimate:
-    return Estimate(max(values), min(values), max(values), len(values), 0, "largest, with the range")
+    return Estimate(max(values), len(values), 0, "largest, with the range", low=min(values), high=max(values))
 
 
 @pytest.mark.parametrize("form", formats.FORMATS)

@@ -53,12 +53,12 @@ class Estimate:
 
     Args:
         value: None without enough seeds.
-        low: lower end of the interval, if any.
-        high: upper end.
         n: seeds with a value.
         n_undefined: seeds without one.
         method: what value and interval are.
         reason: why value or interval are missing, or why an interval of equal seeds is wide.
+        low: lower end of the interval, if any.
+        high: upper end.
         std: standard deviation over seeds, shown in place of an interval.
         digits: after the point, where it is shown.
 
@@ -67,12 +67,12 @@ class Estimate:
     """
 
     value: float | None
-    low: float | None
-    high: float | None
     n: int
     n_undefined: int
     method: str
     reason: str | None = None
+    low: float | None = None
+    high: float | None = None
     std: float | None = None
     digits: int = 2
 
@@ -165,7 +165,7 @@ def mean(values: Values, level: float = LEVEL, bounds: LowHigh = UNBOUNDED) -> E
         lowest, highest = limits if within else UNBOUNDED
         low = min(max(lowest, centre - half), centre)
         high = max(min(highest, centre + half), centre)
-    return Estimate(centre, low=low, high=high, n=len(known), n_undefined=missing, method=method, reason=reason)
+    return Estimate(centre, len(known), missing, method, reason, low=low, high=high)
 
 
 def constant(values: Values) -> Estimate:
@@ -173,7 +173,7 @@ def constant(values: Values) -> Estimate:
     known, missing = _known(values)
     if not known:
         return _nothing(missing, "exact")
-    return Estimate(fmean(known), None, None, len(known), missing, method="exact")
+    return Estimate(fmean(known), len(known), missing, "exact")
 
 
 @takes_numbers
@@ -189,8 +189,7 @@ def mean_and_std(values: Values) -> Estimate:
         return _nothing(missing, method)
     std = float(np.std(known, ddof=1)) if len(known) > 1 else None
     reason = "one seed has no standard deviation" if std is None else None
-    centre = fmean(known)
-    return Estimate(centre, None, None, len(known), missing, method=method, reason=reason, std=std)
+    return Estimate(fmean(known), len(known), missing, method, reason, std=std)
 
 
 @takes_numbers
@@ -210,7 +209,7 @@ def iqm(values: Sequence[Values], level: float = LEVEL, resamples: int = RESAMPL
         return _nothing(undefined, method)
     value = float(stats.trim_mean(np.concatenate(known), 0.25))
     if n == 1:
-        return Estimate(value, None, None, n, undefined, method=method, reason="one seed has no interval")
+        return Estimate(value, 1, undefined, method, "one seed has no interval")
 
     def middle(*tasks: np.ndarray, axis: int) -> np.ndarray:
         return np.asarray(stats.trim_mean(np.concatenate(tasks, axis=axis), 0.25, axis=axis))
@@ -228,7 +227,7 @@ def iqm(values: Sequence[Values], level: float = LEVEL, resamples: int = RESAMPL
     low = min(value, float(found.confidence_interval.low))
     high = max(value, float(found.confidence_interval.high))
     reason = "the bootstrap samples are equal: no spread to estimate" if low == high else None
-    return Estimate(value, low=low, high=high, n=n, n_undefined=undefined, method=method, reason=reason)
+    return Estimate(value, n, undefined, method, reason, low=low, high=high)
 
 
 @takes_numbers
@@ -245,7 +244,7 @@ def solved_rate(solved: Sequence[bool | None], level: float = LEVEL) -> Estimate
     if not known:
         return _nothing(missing, method, "no seed has a result")
     low, high = gaffke(known, Bounds(0.0, 1.0), level)
-    return Estimate(sum(known) / len(known), low=low, high=high, n=len(known), n_undefined=missing, method=method)
+    return Estimate(sum(known) / len(known), len(known), missing, method, low=low, high=high)
 
 
 @takes_numbers
@@ -267,15 +266,7 @@ def median_time(times: Values, level: float = LEVEL) -> Estimate:
     ordered = [0.0, *sorted(known), math.inf]
     k = median_ranks(n, level)
     reason = None if k else f"the range of the times covers {1 - 0.5 ** (n - 1):.0%}"
-    return Estimate(
-        median(known),
-        low=ordered[k],
-        high=ordered[n + 1 - k],
-        n=n,
-        n_undefined=missing,
-        method=method,
-        reason=reason,
-    )
+    return Estimate(median(known), n, missing, method, reason, low=ordered[k], high=ordered[n + 1 - k])
 
 
 @takes_numbers
@@ -300,7 +291,7 @@ def interquartile_mean(
     method = f"IQM, stratified bootstrap {level:.0%}"
     if n < LEAST_FOR_BOOTSTRAP:
         reason = f"needs {LEAST_FOR_BOOTSTRAP} seeds of each task, got {n}"
-        return Estimate(None, low=None, high=None, n=n, n_undefined=undefined, method=method, reason=reason)
+        return Estimate(None, n, undefined, method, reason)
     rng = np.random.default_rng(seed)
     limits = []
     for bound, tail in ((lowest, (1 - level) / 2), (highest, (1 + level) / 2)):
@@ -317,7 +308,7 @@ def interquartile_mean(
     value = float(pooled[cut : len(pooled) - cut].mean())
     low = min(limits[0], value)
     high = max(limits[1], value)
-    return Estimate(value, low=low, high=high, n=n, n_undefined=undefined, method=method)
+    return Estimate(value, n, undefined, method, low=low, high=high)
 
 
 @takes_numbers
@@ -427,7 +418,7 @@ def seeds_needed(difference: float, std: float, paired: bool = False, level: flo
 
 
 def _nothing(missing: int, method: str, reason: str = "no seed has a value") -> Estimate:
-    return Estimate(None, None, None, 0, missing, method=method, reason=reason)
+    return Estimate(None, 0, missing, method, reason)
 
 
 def _of_tasks(values: Sequence[Values], who: str, level: float, resamples: int) -> tuple[list[list[float]], int, int]:

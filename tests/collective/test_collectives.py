@@ -13,8 +13,8 @@ from helpers.sweeping import command_line, sweep
 
 import curricula
 from ctgraph_rl import RunLog
-from ctgraph_rl.collective import __main__ as collectives
 from ctgraph_rl.collective import job
+from ctgraph_rl.collective import report as collectives
 from ctgraph_rl.collective.report import find_collectives
 from ctgraph_rl.collective.summary import metrics, read_collective
 from ctgraph_rl.runs.checkpoints import Checkpoints

@@ -13,8 +13,8 @@ from helpers.made_runs import write_run
 import curricula
 from ctgraph_rl import RunLog
 from ctgraph_rl.play.visits import Visits
-from ctgraph_rl.report import __main__ as command
 from ctgraph_rl.report import page
+from ctgraph_rl.report import page as command
 from ctgraph_rl.report.figures.gallery import Gallery
 from ctgraph_rl.report.figures.trees import Trees, draw_trees, task_trees
 from ctgraph_rl.report.page import write_report

@@ -176,7 +176,7 @@ def test_a_mean_beyond_its_bounds_by_rounding_is_an_end_of_its_interval(values, 
 @pytest.mark.parametrize(("low", "high"), [(0.6, 0.9), (0.1, 0.4), (None, 0.9), (0.1, None), (math.nan, 0.9)])
 def test_an_estimate_outside_of_its_interval_cannot_be_built(low, high):
     with pytest.raises(ValueError, match=r"an interval must have two ends around its value, got 0.5"):
-        Estimate(0.5, low, high, 5, 0, method="-")
+        Estimate(0.5, 5, 0, "-", low=low, high=high)
 
 
 @pytest.mark.parametrize(
@@ -230,7 +230,7 @@ def test_the_interquartile_mean_is_of_the_middle_half_of_all_tasks_together():
 
 
 def test_a_value_that_rounds_to_zero_has_no_sign():
-    assert str(statistics.Estimate(-0.001, -0.004, 0.2, n=3, n_undefined=0, method="mean")) == "0.00 [0.00, 0.20] n = 3"
+    assert str(statistics.Estimate(-0.001, 3, 0, "mean", low=-0.004, high=0.2)) == "0.00 [0.00, 0.20] n = 3"
 
 
 def test_the_bootstrap_is_stratified_so_tasks_without_spread_stay_as_they_are():

@@ -32,7 +32,7 @@ def two_groups(
     n = min(len(first), len(second))
     value = float(measure(first.mean(0), second.mean(0)))
     if n < 2:
-        return Estimate(value, None, None, n, 0, method=method, reason="one seed has no interval")
+        return Estimate(value, n, 0, method, "one seed has no interval")
     rng = np.random.default_rng(0)
     limits = []
     for ends, tail in (((lowest, highest), (1 - LEVEL) / 2), ((highest, lowest), (1 + LEVEL) / 2)):
@@ -41,4 +41,4 @@ def two_groups(
             weights = rng.dirichlet(np.ones(len(group) + 1), RESAMPLES)
             means.append(weights @ np.vstack([group, np.full(group.shape[1], end)]))
         limits.append(float(np.quantile(measure(*means), tail, method="lower" if tail < 0.5 else "higher")))
-    return Estimate(value, low=min(limits[0], value), high=max(limits[1], value), n=n, n_undefined=0, method=method)
+    return Estimate(value, n, 0, method, low=min(limits[0], value), high=max(limits[1], value))

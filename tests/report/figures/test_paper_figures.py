@@ -9,8 +9,8 @@ import pytest
 from helpers.made_runs import all_runs, write_run
 
 from ctgraph_rl.draw.style import picture
-from ctgraph_rl.report import __main__ as command
 from ctgraph_rl.report import page
+from ctgraph_rl.report import page as command
 from ctgraph_rl.report.figures.aggregates import (
     improvements,
     performance_profile,
