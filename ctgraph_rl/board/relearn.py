@@ -18,7 +18,6 @@ import torch
 from omegaconf import DictConfig
 
 from ctgraph_rl.checks import ReadOnlyValues, require
-from ctgraph_rl.disk import write_whole
 from ctgraph_rl.runs import config
 from ctgraph_rl.runs.job import run_as_one, run_job
 from ctgraph_rl.runs.settings import with_added
@@ -33,15 +32,6 @@ class Relearning(NamedTuple):
     num_threads: int
     entry_point: str | None  # module:function of a learner that is not ours
     curriculum: str | None = None  # file of what it learns; None: what the configuration says
-
-    def write(self, path: Path) -> None:
-        """Write the job to a file."""
-        write_whole(path, json.dumps(self._asdict()))
-
-    @classmethod
-    def read(cls, path: Path) -> Relearning:
-        """Read what `write` wrote."""
-        return cls(**json.loads(path.read_text(encoding="utf-8")))
 
 
 def run_dir_of(folder: Path, seed: int) -> Path:
@@ -88,4 +78,5 @@ def configuration(stored: ReadOnlyValues) -> DictConfig:
 if __name__ == "__main__":
     sys.path += sys.argv[2:]
     os.environ["PYTHONPATH"] = os.pathsep.join([os.environ.get("PYTHONPATH", ""), *sys.argv[2:]])
-    learn_again(Relearning.read(Path(sys.argv[1])), Path.cwd())
+    job = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    learn_again(Relearning(**job), Path.cwd())

@@ -7,6 +7,7 @@ that were trained as one group are trained again as one group.
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import platform
 import shutil
@@ -133,7 +134,7 @@ def learn_again(cell: RerunCell, limits: Limits, isolated: Isolation, code: Sequ
         file = cell.folder.resolve() / CURRICULUM
         write_whole(file, file_text(cell.curriculum.to_json()))
         job = job._replace(curriculum=str(file))
-    job.write(cell.folder / JOB)
+    write_whole(cell.folder / JOB, json.dumps(job._asdict()))
     found_in = [path.resolve() for path in code]
     command = [sys.executable, "-P", "-s", "-m", "ctgraph_rl.board.relearn", JOB, *map(str, found_in)]
     variables = {"PYTHONPATH": str(home()), "PYTHONDONTWRITEBYTECODE": "1"}

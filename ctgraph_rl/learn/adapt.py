@@ -25,7 +25,7 @@ def adapt(policy: Any, greedy: bool, num_actions: int | None, shows_ids: bool = 
     """
     if isinstance(policy, TensorDictModuleBase | type):
         return policy
-    act = partial(_NumpyPolicy, discrete=num_actions is not None)
+    act = partial(_of_arrays, discrete=num_actions is not None)
     if hasattr(policy, "predict"):
         predict = policy.predict
         space = getattr(policy, "observation_space", None)
@@ -51,21 +51,21 @@ def _parts(shown: Any) -> tuple[Any, Any]:
     return (shown["observation"], shown["task_id"]) if isinstance(shown, dict) else (shown, None)
 
 
-class _NumpyPolicy:
-    def __init__(self, act: Callable[[Any, Any, Any], tuple[Any, Any]], discrete: bool = True) -> None:
-        self.act = act
-        self.discrete = discrete
-        self.state = None
+def _of_arrays(act: Callable[[Any, Any, Any], tuple[Any, Any]], discrete: bool) -> Policy:
+    state = None
 
-    def __call__(self, data: TensorDictBase) -> TensorDictBase:
+    def policy(data: TensorDictBase) -> TensorDictBase:
+        nonlocal state
         observation: Any = data["observation"].numpy()
         if "task_id" in data.keys():  # noqa: SIM118, a TensorDict iterates over rows
             observation = {"observation": observation, "task_id": data["task_id"].numpy()}
-        actions, self.state = self.act(observation, self.state, data["is_init"].squeeze(-1).numpy())
+        actions, state = act(observation, state, data["is_init"].squeeze(-1).numpy())
         actions = np.asarray(actions)
-        if not self.discrete:
+        if not discrete:
             return data.set("action", torch.from_numpy(actions.astype(np.float32)))
         whole = np.issubdtype(actions.dtype, np.integer) and actions.shape == data.batch_size
         got = f"{actions.dtype} {list(actions.shape)}"
         require((whole, f"a policy must return {data.batch_size[0]} integer actions, one for each row, got {got}"))
         return data.set("action", torch.from_numpy(actions.astype(np.int64)))
+
+    return policy

@@ -158,7 +158,6 @@ class _Learner:
         self.device = device
         self.saved = saved
         self.random = member.random
-        self.random_cuda = None
         if device.type == "cuda":
             self.random_cuda = torch.Generator(device=device).manual_seed(member.seed).get_state()
         self.is_done = saved is not None and saved["done"]
@@ -185,24 +184,17 @@ class _Learner:
 
     @contextmanager
     def drawing(self) -> Iterator[None]:
-        before = torch.get_rng_state()
-        before_cuda = self._cuda_state()
-        torch.set_rng_state(self.random)
-        self._set_cuda_state(self.random_cuda)
-        try:
-            yield
-        finally:
-            self.random = torch.get_rng_state()
-            self.random_cuda = self._cuda_state()
-            torch.set_rng_state(before)
-            self._set_cuda_state(before_cuda)
-
-    def _cuda_state(self) -> Tensor | None:
-        return torch.cuda.get_rng_state(self.device) if self.device.type == "cuda" else None
-
-    def _set_cuda_state(self, state: Tensor | None) -> None:
-        if state is not None:
-            torch.cuda.set_rng_state(state, self.device)
+        cuda = [self.device] if self.device.type == "cuda" else []
+        with torch.random.fork_rng(cuda):
+            torch.set_rng_state(self.random)
+            for device in cuda:
+                torch.cuda.set_rng_state(self.random_cuda, device)
+            try:
+                yield
+            finally:
+                self.random = torch.get_rng_state()
+                for device in cuda:
+                    self.random_cuda = torch.cuda.get_rng_state(device)
 
     def advance(self) -> bool:
         if self.is_done:

@@ -69,9 +69,19 @@ class Table(NamedTuple):
 
 
 def document(tables: Iterable[Table]) -> str:
-    """Return tables in LaTeX, each with a label."""
-    labels = Labels()
-    return "\n\n".join([PREAMBLE, *(latex(table._replace(label=labels.new(table.label))) for table in tables)])
+    """Return tables in LaTeX, each with another label of letters, digits and hyphens."""
+    parts = [PREAMBLE]
+    taken = set()
+    for table in tables:
+        stem = re.sub(r"[^a-z0-9]+", "-", table.label.lower()).strip("-")
+        label = stem
+        version = 1
+        while label in taken:
+            version += 1
+            label = f"{stem}-v{version}"
+        taken.add(label)
+        parts.append(latex(table._replace(label=label)))
+    return "\n\n".join(parts)
 
 
 def latex(table: Table) -> str:
@@ -132,21 +142,3 @@ def letters(number: int) -> str:
     """Return the letters of a note, from 1: a to z, then aa; numbers would look like exponents."""
     rest, last = divmod(number - 1, len(ascii_lowercase))
     return (letters(rest) if rest else "") + ascii_lowercase[last]
-
-
-class Labels:
-    """Gives every table of a document a different label."""
-
-    def __init__(self) -> None:
-        self._taken: set[str] = set()
-
-    def new(self, *names: str) -> str:
-        """Return a new label of letters, digits and hyphens."""
-        stem = re.sub(r"[^a-z0-9]+", "-", "-".join(names).lower()).strip("-")
-        label = stem
-        version = 1
-        while label in self._taken:
-            version += 1
-            label = f"{stem}-v{version}"
-        self._taken.add(label)
-        return label

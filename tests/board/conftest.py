@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -106,7 +107,7 @@ def in_process(monkeypatch):
     def run(command, folder, limits, isolated, paths=(), variables=None):
         folders.append(folder)
         try:
-            relearn.learn_again(Relearning.read(folder / rerun.JOB), folder)
+            relearn.learn_again(Relearning(**json.loads((folder / rerun.JOB).read_text())), folder)
         except Exception as error:
             return Outcome(1, None, f"{type(error).__name__}: {error}")
         return Outcome(0, None, "")
