@@ -96,12 +96,9 @@ def csv_text(rows: Iterable[Iterable[Any]], end: str = "\n") -> str:
 
 def _line(row: Iterable[Any]) -> str:
     file = io.StringIO(newline="")
-    csv.writer(file, lineterminator="\r\n").writerow(map(_cell, row))
+    cells = [MARK + value if isinstance(value, str) and value.startswith(FORMULA) else value for value in row]
+    csv.writer(file, lineterminator="\r\n").writerow(cells)
     return file.getvalue().removesuffix("\r\n")
-
-
-def _cell(value: Any) -> Any:
-    return MARK + value if isinstance(value, str) and value.startswith(FORMULA) else value
 
 
 def utf8_text(text: object) -> object:

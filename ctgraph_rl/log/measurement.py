@@ -139,10 +139,9 @@ def check(measurement: ReadOnlyValues, most: int = MOST) -> None:
 def without_time(measurement: ReadOnlyValues) -> NamedValues:
     """Return a measurement without time and experts' directories: equal in equal runs."""
     kept = {key: value for key, value in measurement.items() if key != "seconds"}
-    if isinstance(kept.get("experts"), list):
-        kept["experts"] = [_without_place(each) for each in kept["experts"]]
+    if "experts" in kept:
+        experts = []
+        for expert in kept["experts"]:
+            experts.append({key: value for key, value in expert.items() if key != "run"})
+        kept["experts"] = experts
     return kept
-
-
-def _without_place(expert: Any) -> Any:
-    return {key: value for key, value in expert.items() if key != "run"} if isinstance(expert, dict) else expert

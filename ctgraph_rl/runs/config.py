@@ -8,8 +8,8 @@ import os
 import re
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from copy import deepcopy
 from functools import partial
 from pathlib import Path
@@ -331,27 +331,20 @@ def curriculum_of(name: str, config_dir: Path | None = None) -> Curriculum:
 def composed(settings: Sequence[str], config_dir: Path | None = None) -> DictConfig:
     """Return the configuration of a command line, leaving a program's own Hydra unchanged.
 
+    Its ``version_base``, resolvers and job name, on which further directories depend, stay.
+
     Args:
         settings: such as ``agent=ppo``.
         config_dir: is searched after ``conf``.
     """
     searched = [] if config_dir is None else [f"hydra.searchpath=[{json.dumps(str(config_dir.resolve()))}]"]
-    with _hydra_of_its_own(), of_hydra(hydra.initialize_config_dir)(conf_dir()):
-        return hydra.compose("config", [*settings, *searched])
-
-
-@contextmanager
-def _hydra_of_its_own() -> Iterator[None]:
-    """Let Hydra start from nothing, in one thread at a time, and then restore a program's own Hydra.
-
-    Its ``version_base``, resolvers and job name, on which further directories depend, stay.
-    """
-    with _HYDRA:
+    with _HYDRA:  # Hydra starts from nothing, in one thread at a time
         singletons = {kind: Singleton._instances.pop(kind) for kind in RENEWED if kind in Singleton._instances}
         resolvers = dict(BaseContainer._resolvers)
         try:
             register_run_name()
-            yield
+            with of_hydra(hydra.initialize_config_dir)(conf_dir()):
+                return hydra.compose("config", [*settings, *searched])
         finally:
             for kind in RENEWED:
                 Singleton._instances.pop(kind, None)

@@ -152,7 +152,11 @@ class Sweeper(Base):
                 with sigterm_exits(), SweepProgress(before):
                     self._launch(self._jobs(left), errors)
         finally:
-            found = {folder: self._status(folder, before[folder], errors.get(folder)) for folder in cells}
+            found = {}
+            for folder in cells:
+                found[folder] = status_of(folder, before[folder], errors.get(folder))
+                if found[folder].state == MISSING and folder in self._stale:
+                    found[folder] = Status(STALE, f"{self._stale[folder]} changed")
             if self._num_unknown:
                 unsaid = "cells do not say of which source they are, so it may have changed since"
                 print(f"note: {self._num_unknown} {unsaid}")
@@ -185,11 +189,6 @@ class Sweeper(Base):
         [batch] = self.split_arguments(overrides, None)
         return batch
 
-    def _status(self, folder: Path, before: RunOutcome, error: str | None) -> Status:
-        found = status_of(folder, before, error)
-        stale = found.state == MISSING and folder in self._stale
-        return Status(STALE, f"{self._stale[folder]} changed") if stale else found
-
     def cells(self, batch: Sequence[Overrides]) -> dict[Path, Overrides]:
         """Return the cells by run directory, the first of equal ones; changes of code are kept, unless all run again.
 
@@ -219,14 +218,15 @@ class Sweeper(Base):
                 if alike not in composed:
                     composed[alike] = self._composed(overrides, choices)
                     check_resolved(composed[alike])
+                cfg = composed[alike]
                 for key, value in values.items():
-                    OmegaConf.update(composed[alike], key, value)
-                check_settings(composed[alike])
-                self._has_tuning |= composed[alike].objective_until is not None
-                sweep = composed[alike].hydra.sweep
+                    OmegaConf.update(cfg, key, value)
+                check_settings(cfg)
+                self._has_tuning |= cfg.objective_until is not None
+                sweep = cfg.hydra.sweep
                 folder = Path(sweep.dir).absolute() / sweep.subdir
                 if folder not in found and self.config.overwrite is not True:
-                    self._compare(composed[alike], folder)
+                    self._compare(cfg, folder)
                 found.setdefault(folder, overrides)
         return found
 
