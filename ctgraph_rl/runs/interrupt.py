@@ -66,16 +66,11 @@ class Interrupt:
         self._restore()
         if callable(requeue):
             with _deaf():
-                shown = _shown_job()
-                # not a job that SLURM ends for good, as by ``scancel``, which a requeue would undo
-                if "JobState=COMPLETING" not in shown and "JobState=CANCELLED" not in shown:
+                if not _is_being_ended():
                     try:
                         requeue(_requeuing(), None)
                     except (OSError, subprocess.SubprocessError) as error:
-                        # SLURM counts a restart at once, while it ends this job
-                        restarts = re.search(r"Restarts=(\d+)", _shown_job())
-                        before = int(os.environ.get("SLURM_RESTART_COUNT") or 0)
-                        if restarts is None or int(restarts[1]) <= before:
+                        if not _is_in_queue():
                             said = f"SLURM did not put job {_job()} into the queue again, as scontrol requeue failed"
                             raise RuntimeError(f"{said}: the same command resumes the run") from error
         raise SystemExit(128 + self.signal)
@@ -105,6 +100,18 @@ def _deaf() -> Iterator[None]:
         for number, handler in before.items():
             if handler is not None:  # it was not set by Python
                 signal.signal(number, handler)
+
+
+def _is_being_ended() -> bool:
+    """Return whether SLURM ends this job for good, as by ``scancel``, which a requeue would undo."""
+    shown = _shown_job()
+    return "JobState=COMPLETING" in shown or "JobState=CANCELLED" in shown
+
+
+def _is_in_queue() -> bool:
+    """Return whether SLURM has queued the job: it counts a restart at once, while it ends this one."""
+    restarts = re.search(r"Restarts=(\d+)", _shown_job())
+    return restarts is not None and int(restarts[1]) > int(os.environ.get("SLURM_RESTART_COUNT") or 0)
 
 
 def _shown_job() -> str:
