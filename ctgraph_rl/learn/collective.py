@@ -289,10 +289,13 @@ class _Collective:
                 continue
             for given in self.exchange.receive(number, messages):
                 frames = self.learners[given.receiver].steps.frames
-                place = {"block": self.members[given.receiver].curriculum.block_at(frames), "frames": frames}
+                member = self.members[given.receiver]
+                block = member.curriculum.block_at(frames)
                 values = {"sender": given.sender, **given.values}
-                self.members[given.receiver].log.append("help", **place, **values)
-                self.log.append("help", round=self.rounds, **place, receiver=given.receiver, **values)
+                member.log.append("help", block=block, frames=frames, **values)
+                self.log.append(
+                    "help", round=self.rounds, block=block, frames=frames, receiver=given.receiver, **values
+                )
         for kind in sorted({of for of, _ in self.mail.counts}):
             counts = {what: self.mail.counts[kind, what] for what in (SENT, DELIVERED, DROPPED, DELAYED)}
             self.log.append(
