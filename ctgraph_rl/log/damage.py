@@ -37,9 +37,9 @@ def damaged(run_dir: Path) -> list[str]:
 
 
 def _is_readable(path: Path) -> bool:
-    if not path.exists():
-        return path.name != LOG
     try:
+        if not path.exists():
+            return path.name != LOG
         if not path.is_file():
             return False
         if path.name == AGENT:
