@@ -81,9 +81,9 @@ def _learn(session: Session, cfg: Any, cells: Sequence[ConfigAndPath], exchange:
         for number, (each, folder) in enumerate(cells):
             try:
                 members.append(build(each, folder, interrupt))
-            except ValueError as error:
+            except ValueError as why:
                 agent = f"curriculum.agent={each.curriculum.agent}, " if "agent" in each.curriculum else ""
-                raise ValueError(f"member {number} ({agent}seed={each.seed}): {error}") from error
+                raise ValueError(f"member {number} ({agent}seed={each.seed}): {why}") from why
         listed = "a collective's tables list tasks, which a stream draws one by one: take Stream.first(n)"
         require((not any(isinstance(member.curriculum, Stream) for member in members), listed))
         _warn_of_long_ids([member.curriculum for member in members])
