@@ -136,19 +136,15 @@ def _first_episodes(env: EnvBase, policy: Policy, initial_state: InitialState | 
 EPISODE_KEYS = ("episode_reward", "outcome", "step_count")
 
 
-def episode_means(ends: TensorDictBase) -> NamedValues:
+def means_by_part(ends: TensorDictBase, counts: Sequence[int]) -> list[NamedValues]:
     """Return the count of episodes, their mean return and length, and the shares that reach the goal and any end.
 
     Means are NaN without an episode; shares are NaN for other tasks than CT-graphs.
 
     Args:
         ends: data of the last step of each episode.
+        counts: the sizes of successive parts, each with a result.
     """
-    return means_by_part(ends, [ends.batch_size[0]])[0]
-
-
-def means_by_part(ends: TensorDictBase, counts: Sequence[int]) -> list[NamedValues]:
-    """Return `episode_means` of successive parts of some sizes, with one transfer of each key from a device."""
     outcome = ends.get("outcome", None)
     values = {
         "return_mean": ends["episode_reward"],
@@ -183,7 +179,8 @@ def adaptation(rows: TensorDictBase, task: TaskLike) -> Iterator[NamedValues]:
         found = reached.cummax(dim=1).values.double().mean(dim=0)
     for step, episodes in enumerate(rows.unbind(1)):
         rates = {"found_rate": found[step].item(), "exact_rate": exact[step].item()}
-        yield {"step": step + 1, **episode_means(episodes), **rates}
+        [means] = means_by_part(episodes, [num_rows])
+        yield {"step": step + 1, **means, **rates}
 
 
 def derive_seed(seed: int, *purpose: str | int) -> int:

@@ -165,24 +165,6 @@ def profile_scores(paths: Sequence[Path | str], agents: Sequence[str] = ()) -> d
     Raises:
         ValueError: if there is no run of a profile curriculum.
     """
-    scores: dict[str, dict[str, Score]] = {}
-    for agent, by_title in profile_results(paths, agents).items():
-        scores[agent] = {title: score_of_results(results) for title, results in by_title.items()}
-    return scores
-
-
-def score_of_results(results: Results) -> Score:
-    """Return `score_of` the results, or a gap with its reason."""
-    if not results.seeds:
-        return Score(None, reason=results.reason)
-    try:
-        return score_of(list(results.seeds.values()), results.controls)._replace(reason=results.reason)
-    except Undefined as error:
-        return Score(None, reason=": ".join(filter(None, [results.reason, str(error)])))
-
-
-def profile_results(paths: Sequence[Path | str], agents: Sequence[str] = ()) -> dict[str, dict[str, Results]]:
-    """Return what each agent's seeds measured, by the title of each property, as `profile_scores` reads it."""
     check_packages()
     properties = import_module("curricula.profile").PROPERTIES
     names = {*properties}
@@ -198,13 +180,23 @@ def profile_results(paths: Sequence[Path | str], agents: Sequence[str] = ()) -> 
         for run in present(by_seed):
             kinds[MODIFIED in curriculum].setdefault(run.group[0], {})[run.seed] = run
     read: dict[Path, Evidence] = {}
-    results: dict[str, dict[str, Results]] = {}
+    scores: dict[str, dict[str, Score]] = {}
     for agent, kinds in of_agents.items():
-        results[agent] = {}
+        scores[agent] = {}
         for name, prop in properties.items():
             began = [problem.reason for problem in problems if problem.path.parent.name == name]
-            results[agent][prop.title] = _results(kinds, name, prop, read, began)
-    return results
+            scores[agent][prop.title] = score_of_results(_results(kinds, name, prop, read, began))
+    return scores
+
+
+def score_of_results(results: Results) -> Score:
+    """Return `score_of` the results, or a gap with its reason."""
+    if not results.seeds:
+        return Score(None, reason=results.reason)
+    try:
+        return score_of(list(results.seeds.values()), results.controls)._replace(reason=results.reason)
+    except Undefined as error:
+        return Score(None, reason=": ".join(filter(None, [results.reason, str(error)])))
 
 
 RunsByName = dict[str, dict[int, Run]]

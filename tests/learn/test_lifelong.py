@@ -88,7 +88,7 @@ def test_no_episode_is_no_episode():
     env = CTGraphEnv([ONE, TWO])
     ends = env.reset()[torch.tensor([False, False])]
 
-    means = evaluation.episode_means(ends)
+    [means] = evaluation.means_by_part(ends, [0])
 
     assert means["episodes"] == 0
     assert all(math.isnan(means[name]) for name in ("return_mean", "success_rate", "length_mean"))

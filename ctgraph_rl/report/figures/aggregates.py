@@ -51,13 +51,13 @@ def scores(result: Result) -> dict[str, np.ndarray]:
     return {task: np.array(values, dtype=np.float64) for task, values in found.items()}
 
 
-def performance_profile(of_tasks: Scores, thresholds: np.ndarray, seed: int = 0) -> Interval:
+def performance_profile(of_tasks: Scores, thresholds: np.ndarray) -> Interval:
     """Return the share of runs and tasks with a score above each threshold, float64 [thresholds], with its interval.
 
     Args:
         thresholds: float64 [thresholds].
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     drawn = np.concatenate([_drawn(values, rng) for values in of_tasks.values()], axis=1)
     shares = np.stack([(drawn > threshold).mean(axis=1) for threshold in thresholds], axis=1)
     low, high = np.quantile(shares, TAILS, axis=0)
@@ -69,12 +69,12 @@ def _pooled(of_tasks: Scores) -> np.ndarray:
     return np.concatenate(list(of_tasks.values()))
 
 
-def probability_of_improvement(first: Scores, second: Scores, seed: int = 0) -> Interval:
+def probability_of_improvement(first: Scores, second: Scores) -> Interval:
     """Return the probability that a run of one agent is better than one of another, the mean over shared tasks.
 
     It is the statistic of Mann and Whitney over the number of pairs of seeds; equal scores count half.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     tasks = [task for task in first if task in second]
     value = np.mean([_better(first[task][None], second[task][None])[0] for task in tasks])
     drawn = np.mean([_better(_drawn(first[task], rng), _drawn(second[task], rng)) for task in tasks], axis=0)
