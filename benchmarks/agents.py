@@ -114,7 +114,7 @@ class Ours:
     Args:
         values: its settings.
         captured: whether a GPU replays its steps.
-        env: settings of the environment.
+        checked: whether the environment checks actions and says how episodes end.
     """
 
     def __init__(
@@ -124,10 +124,10 @@ class Ours:
         seed: int,
         device: torch.device = CPU,
         captured: bool = True,
-        **env: bool,
+        checked: bool = True,
     ) -> None:
         torch.manual_seed(seed)
-        rows = CTGraphEnv([task] * values["num_envs"], seed, device=device, **env)
+        rows = CTGraphEnv([task] * values["num_envs"], seed, device=device, check_actions=checked, info=checked)
         self.task = task
         self.agent = agent = built(values, task).to(device)
         if not captured:
@@ -226,7 +226,7 @@ def rungs(device: torch.device, num_rows: Sequence[int], num_seeds: Sequence[int
     for name, label in ON_DEVICE.items():
         task = TASKS[label]
         values = settings(name)
-        learner = partial(Ours, task=task, seed=0, device=device, check_actions=False, info=False)
+        learner = partial(Ours, task=task, seed=0, device=device, checked=False)
         for n in num_rows if name in GOALS else ():
             yield Rung(ENVIRONMENT, label, n, partial(ladder.WAYS["rollout, captured"], [task] * n, device))
             given = {**values, "num_envs": n}
@@ -234,11 +234,15 @@ def rungs(device: torch.device, num_rows: Sequence[int], num_seeds: Sequence[int
             if name == "ppo":
                 ways["compiled and captured"] = partial(learner, {**given, "compile": True})
             for way, make in ways.items():
-                yield Rung(f"{name}, {way}", label, n, lambda make=make: make().learn, GOALS[name])
+                yield Rung(f"{name}, {way}", label, n, partial(_learn_of, make), GOALS[name])
         for count in num_seeds:
             goal = SEEDS_GOAL if name == "lstm_ppo" else 0.0
             together = partial(seeds, values, task, count, device)
             yield Rung(f"{name}, {count:,} seeds as one job", label, count * values["num_envs"], together, goal)
+
+
+def _learn_of(make: Callable[[], Ours]) -> TimedRun:
+    return make().learn
 
 
 def seeds(values: NamedValues, task: Task, num_seeds: int, device: torch.device) -> TimedRun:

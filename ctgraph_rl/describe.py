@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import chain, compress, pairwise
 from pathlib import Path
 from statistics import fmean
@@ -22,10 +22,9 @@ from ctgraph_rl.runs.config import curriculum_of
 from ctgraph_rl.runs.settings import curriculum_names
 from ctgraph_rl.tasks.curriculum import LAGS, Curriculum, Stream
 from ctgraph_rl.tasks.exactness import MOST_HISTORIES, count_histories
-from ctgraph_rl.tasks.kinds.task_like import TaskLike
 from ctgraph_rl.tasks.memory import bank_bytes
 from ctgraph_rl.tasks.observability import POLICIES, state_entropy, states_per_observation
-from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
+from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from ctgraph_rl.tasks.similarity import shared_images, state_agreement
 from ctgraph_rl.tasks.task import Task, are_graphs, ct_graphs
 from ctgraph_rl.tasks.values import open_loop_ceiling, random_frames_to_goal
@@ -228,8 +227,15 @@ def _blocks(curriculum: Curriculum) -> Sheet:
         columns["switch"] = "l"
     rows = []
     for number, block in enumerate(shown, 1):
-        for row in _block_rows(number, block, labels):
+        name = str(number)
+        frames = f"{block.num_frames:,}"
+        switch = "" if block.switch is None else repr(block.switch)
+        for task in dict.fromkeys(ct_graphs(block.tasks, "this sheet")):
+            graph = task.graph
+            shape = (str(graph.branching_factor), str(graph.depth), f"{graph.wait_prob:g}")
+            row = (name, labels[task], *shape, write_goal(task.goal), frames, switch)
             rows.append(row[: len(columns)])
+            name = frames = switch = ""
     more = [f"The first {len(shown)} of {len(curriculum.blocks):,} blocks."] * (len(shown) < len(curriculum.blocks))
     return Sheet("Blocks", columns, tuple(rows), tuple(more))
 
@@ -242,17 +248,6 @@ def _other_blocks(curriculum: Curriculum) -> Sheet:
             rows.append((str(number), labels[task], f"{block.num_frames:,}"))
     note = f"Tasks are of {type(curriculum.tasks[0]).__name__}: difficulty and ceilings are known only of CT-graphs."
     return Sheet("Blocks", {"block": "r", "task": "l", "frames": "r"}, tuple(rows), (note,))
-
-
-def _block_rows(number: int, block: Block, labels: Mapping[TaskLike, str]) -> Iterator[tuple[str, ...]]:
-    name = str(number)
-    frames = f"{block.num_frames:,}"
-    switch = "" if block.switch is None else repr(block.switch)
-    for task in dict.fromkeys(ct_graphs(block.tasks, "this sheet")):
-        graph = task.graph
-        shape = (str(graph.branching_factor), str(graph.depth), f"{graph.wait_prob:g}")
-        yield name, labels[task], *shape, write_goal(task.goal), frames, switch
-        name = frames = switch = ""
 
 
 def _difficulty(curriculum: Curriculum) -> Sheet:

@@ -53,6 +53,9 @@ class ADWIN(Detector):
     needs_episodes = True
     reads = "returns"
 
+    is_whole: Tensor | None
+    """Whether each row's present episode began with the label, bool [rows]; None: before the first batch."""
+
     def __init__(
         self,
         delta: float,
@@ -88,7 +91,10 @@ class ADWIN(Detector):
 
     def observe(self, seen: Seen) -> Verdict:
         """Give ADWIN the returns of ended episodes, or on trial compare them with the kept ones."""
-        ended = self._ended(seen)
+        before = torch.zeros(len(seen.done), dtype=torch.bool, device="cpu") if self.is_whole is None else self.is_whole
+        is_whole = before.unsqueeze(1) | (seen.is_init.cumsum(dim=1) > 0)
+        self.is_whole = is_whole[:, -1].clone()
+        ended = seen.episode_return[seen.done & is_whole].tolist()
         if self.is_trial:
             self.returns.extend(ended)
             return self._accepted()
@@ -102,14 +108,7 @@ class ADWIN(Detector):
         self.returns: list[float] = []
         """In the window, or of the trial."""
 
-        self.is_whole: Tensor | None = None
-        """Whether each row's present episode began with the label, bool [rows]; None: before the first batch."""
-
-    def _ended(self, seen: Seen) -> list[float]:
-        before = torch.zeros(len(seen.done), dtype=torch.bool, device="cpu") if self.is_whole is None else self.is_whole
-        is_whole = before.unsqueeze(1) | (seen.is_init.cumsum(dim=1) > 0)
-        self.is_whole = is_whole[:, -1].clone()
-        return seen.episode_return[seen.done & is_whole].tolist()
+        self.is_whole = None
 
     def _falls(self, episode_return: float) -> bool:
         self.window.update(episode_return)

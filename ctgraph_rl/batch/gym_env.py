@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -22,7 +21,7 @@ from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule, one_of, require
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import beside
 from ctgraph_rl.tasks.kinds.gym_spaces import ActionForm, Taken
-from ctgraph_rl.tasks.kinds.gym_task import GymTask, make_forms, registered
+from ctgraph_rl.tasks.kinds.gym_task import GymTask, kept_while_registered, make_forms
 from ctgraph_rl.tasks.kinds.task_like import close_env
 from ctgraph_rl.tasks.protocol import EPISODES
 
@@ -74,9 +73,7 @@ class GymEnv(EnvBase):
         tasks = require_all(GymTask, "tasks", tasks)
         pool = tasks if task_pool is None else require_all(GymTask, "task_pool", task_pool)
         self.pool = tuple(dict.fromkeys((*pool, *tasks)))
-        require(
-            seed_rule(seed), _same_spaces(self.pool), *(_repeats_rule(task, registered(task)) for task in self.pool)
-        )
+        require(seed_rule(seed), _same_spaces(self.pool), *map(_repeats_rule, self.pool))
         self.num_task_ids = require_num_ids(task_ids, num_task_ids)
         count = len(tasks)
         super().__init__(device=checked_device(device), batch_size=torch.Size([count]))
@@ -339,8 +336,8 @@ def _reset(env: Any, seed: int) -> Any:
         raise ValueError(f"it cannot be reset with a seed: {error}; {fix}") from error
 
 
-@cache
-def _repeats_rule(task: GymTask, key: Any) -> Rule:
+@kept_while_registered
+def _repeats_rule(task: GymTask) -> Rule:
     if not task.repeats:
         return True, ""
     envs: list[Any] = []

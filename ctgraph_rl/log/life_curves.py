@@ -71,7 +71,7 @@ def life_inputs(log: RunLog, stream: Stream) -> NamedValues:
     )
     _fill(curves, log, [block[0] for block in stream.trained[: needed + 1]])
     noisy = not stream.evaluation.exact and any(task.reward_std for task in stream.examples)
-    found = dict.fromkeys(INPUTS, NOT_OF_STREAMS)
+    found: NamedValues = dict.fromkeys(INPUTS, NOT_OF_STREAMS)
     found |= {"life": NOISY if noisy else curves, "interval_best": curves.best}
     return found | {"episodes": episodes, "returns": ratio(total, episodes)}
 

@@ -46,7 +46,7 @@ def life_windows(section: Section) -> CaptionedFigure | None:
     for axes, (metric, title) in zip(of_windows, PANELS.items(), strict=True):
         for position, result in enumerate(shown):
             ends = next((history.ends for history in histories(result.finished)), ())
-            rows = [run.windows(metric) for run in result.finished]
+            rows: list[Any] = [run.windows(metric) for run in result.finished]
             if metric == "frame_regret":
                 rows = [np.divide(row, np.diff(ends)) for row in rows]
             _draw(axes, np.divide(ends[1:], frames), rows, agent_style(position, result.agent))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cache, partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from functools import cache, partial, wraps
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -17,6 +17,8 @@ from ctgraph_rl.tasks.kinds.task_like import close_env, environment
 
 if TYPE_CHECKING:
     import gymnasium
+
+T = TypeVar("T")
 
 WITH_TABLE = ("gymnasium.envs.toy_text.frozen_lake", "gymnasium.envs.toy_text.cliffwalking")
 """Modules of environments that step only by their table ``P``."""
@@ -182,11 +184,8 @@ class GymTask:
         """
         if self.return_range is not None and gamma == 1:
             return self.return_range[1]
-        table = _table(self)  # V_0 = 0, V_t(s) = max_a sum_o p_o (r_o + gamma V_{t-1}(s_o)), but for ends of episodes
-        values = np.zeros(len(table.initial))
-        for _ in range(table.limit):
-            after = table.rewards + gamma * (1 - table.ends) * values[table.following]
-            values = (table.probs * after).sum(-1).max(1)
+        table = _table(self)
+        values = table.values(gamma, lambda after: (table.probs * after).sum(-1).max(1))
         return float(values @ table.initial)
 
     @property
@@ -214,21 +213,26 @@ def time_limit(env: Any) -> int | None:
     return min(limits, default=None)
 
 
-def registered(task: GymTask) -> tuple[Any, ...]:
-    """Return what an id's registration is now, as a key of caches."""
-    from gymnasium import registry
+def kept_while_registered(find: Callable[[GymTask], T]) -> Callable[[GymTask], T]:
+    """Keep what a function finds for as long as the registration of the task's id stays what it is."""
 
-    spec = registry.get(task.id.rpartition(":")[2])
-    return () if spec is None else (spec.entry_point, spec.max_episode_steps, repr(spec.kwargs))
+    @cache
+    def found(task: GymTask, registration: tuple[Any, ...]) -> T:
+        return find(task)
+
+    @wraps(find)
+    def look_up(task: GymTask) -> T:
+        from gymnasium import registry
+
+        spec = registry.get(task.id.rpartition(":")[2])
+        return found(task, () if spec is None else (spec.entry_point, spec.max_episode_steps, repr(spec.kwargs)))
+
+    return look_up
 
 
+@kept_while_registered
 def make_forms(task: GymTask) -> tuple[ObservationForm, ActionForm]:
     """Return the forms of a task's observations and actions."""
-    return _make_forms(task, registered(task))
-
-
-@cache
-def _make_forms(task: GymTask, key: Any) -> tuple[ObservationForm, ActionForm]:
     env = task.make()
     try:
         return _read_forms(task, env)
@@ -253,13 +257,16 @@ class _Table(NamedTuple):
     initial: np.ndarray  # [states]: probability of each state at the start
     limit: int  # steps of an episode
 
+    def values(self, gamma: float, best: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """V_0 = 0, V_t(s) = best of r_o + gamma V_{t-1}(s_o), but for ends of episodes; [states]."""
+        values = np.zeros(len(self.initial))
+        for _ in range(self.limit):
+            values = best(self.rewards + gamma * (1 - self.ends) * values[self.following])
+        return values
 
+
+@kept_while_registered
 def _table(task: GymTask) -> _Table:
-    return _read_table(task, registered(task))
-
-
-@cache
-def _read_table(task: GymTask, key: Any) -> _Table:
     env: Any = task.make()
     try:
         inner = env.unwrapped
@@ -284,10 +291,7 @@ def _read_table(task: GymTask, key: Any) -> _Table:
 def _extreme_return(task: GymTask, choose: Callable[..., Any]) -> float:
     table = _table(task)
     impossible = table.probs == 0
-    values = np.zeros(len(table.initial))
-    for _ in range(table.limit):
-        after = table.rewards + (1 - table.ends) * values[table.following]
-        values = choose(np.where(impossible, np.nan, after), axis=(1, 2))
+    values = table.values(1.0, lambda after: choose(np.where(impossible, np.nan, after), axis=(1, 2)))
     return float(choose(values[table.initial > 0]))
 
 
