@@ -53,10 +53,10 @@ def collect_segment(
     evaluate: Callable[[int], object],
     *,
     policy: Policy,
-    done: int = 0,
-    restore: Callable[[], TensorDictBase] | None = None,
-    num_seeds: int = 1,
-    guide_frames: int = 0,
+    done: int,
+    restore: Callable[[], TensorDictBase] | None,
+    num_seeds: int,
+    guide_frames: int,
 ) -> Iterator[tuple[TensorDictBase, TensorDictBase]]:
     """Yield the batches of a segment, each with the data of the next step.
 
@@ -121,7 +121,7 @@ def log_training(
     start: int,
     measurements: Sequence[Mapping[str, float] | None],
     *,
-    events: Collection[str] = (),
+    events: Collection[str],
 ) -> list[float]:
     """Append a line of each learner for each block that a batch has frames of; return the last lines' mean returns.
 

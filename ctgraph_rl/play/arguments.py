@@ -37,11 +37,11 @@ class Selection(NamedTuple):
     initial_state: InitialState | None = None
     curriculum: Curriculum | None = None
 
-    def player(self, seed: int, greedy: bool = True) -> Player:
+    def player(self, seed: int, greedy: bool) -> Player:
         """Return the policy in its own environment."""
         return Player(self.task, self.policy, self.initial_state, seed=seed, greedy=greedy, curriculum=self.curriculum)
 
-    def visits(self, num_episodes: int, seed: int, greedy: bool = True) -> Visits:
+    def visits(self, num_episodes: int, seed: int, greedy: bool) -> Visits:
         """Count where the policy goes, with as many successive episodes in a row as the curriculum says."""
         assert self.policy is not None
         in_row = 1 if self.curriculum is None else self.curriculum.evaluation.episodes_per_row

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ctgraph_rl.checks import NamedValues
 from ctgraph_rl.log.escape import figure_text, terminal_text
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, left_out
 from ctgraph_rl.report.intervals import Bounds
@@ -59,9 +60,8 @@ def learning_curves(section: Section) -> CaptionedFigure | None:
     grid = panels(len(labels), COLUMNS, 1.45, width, sharex=True, sharey=True)
     for task, (axes, label) in enumerate(zip(grid.ravel(), labels, strict=False)):
         _mark_blocks(axes, section, task)
-        for position, result in enumerate(section.results[:MOST_AGENTS]):
+        for result, look in _looks(section):
             seeds = [history.evaluations.get(label, []) for history in histories(result.finished)]
-            look = agent_style(position, result.agent)
             points = evaluation_curve(result.finished, label, result.bounds.of_task(label))
             _draw(axes, look, [points], seeds if len(seeds) <= MOST_SEEDS else [])
         axes.set_title(short(label))
@@ -78,8 +78,7 @@ def mean_curves(section: Section) -> CaptionedFigure | None:
         f"seeds, up to {MOST_SEEDS}. Dashed: ends of blocks."
     )
     grid = panels(1, 1, 2.3, room=0)
-    shown = section.results[:MOST_AGENTS]
-    draw_means(grid[0, 0], section, {result.agent: agent_style(i, result.agent) for i, result in enumerate(shown)})
+    draw_means(grid[0, 0], section, {result.agent: look for result, look in _looks(section)})
     figure = _finished(grid, section, "mean return over all tasks")
     return CaptionedFigure("mean", "Mean return over all tasks", caption, figure)
 
@@ -98,13 +97,13 @@ def training_curves(section: Section) -> CaptionedFigure | None:
     _mark_blocks(axes, section, None)
     blocks = list(enumerate(zip(section.ends, section.ends[1:], strict=False), 1))
     places = max(4, PLACES // max(len(blocks), 1))
-    for position, result in enumerate(section.results[:MOST_AGENTS]):
+    for result, look in _looks(section):
         pieces = _training(result, blocks, places)
         seeds = []
         for run in result.finished if len(result.finished) < FEWEST_FOR_BANDS else ():
             for piece in _training(replace(result, by_seed={run.seed: run}), blocks, places):
                 seeds += [[(point.frames, point.value) for point in piece]] if piece else []
-        _draw(axes, agent_style(position, result.agent), pieces, seeds)
+        _draw(axes, look, pieces, seeds)
     figure = _finished(grid, section, "return while training")
     return CaptionedFigure("training", "Return while training", caption, figure)
 
@@ -120,9 +119,8 @@ def unit_curves(section: Section) -> CaptionedFigure | None:
     grid = panels(len(UNIT_METRICS), len(UNIT_METRICS), 1.9, sharex=True, sharey=True)
     for axes, (name, title) in zip(grid.ravel(), UNIT_METRICS.items(), strict=True):
         _mark_blocks(axes, section, None)
-        for position, result in enumerate(section.results[:MOST_AGENTS]):
+        for result, look in _looks(section):
             seeds = [history.units[name] for history in histories(result.finished) if name in history.units]
-            look = agent_style(position, result.agent)
             _draw(axes, look, [over_seeds(seeds, Bounds(0, 1))], seeds if len(seeds) <= MOST_SEEDS else [])
         axes.set_title(title)
     return CaptionedFigure("units", "Hidden units", caption, _finished(grid, section, "share"))
@@ -170,6 +168,11 @@ def experiments(found: Sequence[Section]) -> CaptionedFigure | None:
     figure.supxlabel("frames", fontsize=8)
     agents_legend(figure, list(zip(map(short, looks), looks.values(), strict=True)))
     return CaptionedFigure("experiments", "All experiments", caption, figure)
+
+
+def _looks(section: Section) -> list[tuple[Result, NamedValues]]:
+    shown = section.results[:MOST_AGENTS]
+    return [(result, agent_style(position, result.agent)) for position, result in enumerate(shown)]
 
 
 def _agents_on(found: Sequence[Section]) -> list[str]:
@@ -223,8 +226,7 @@ def _finished(grid: Any, section: Section, ylabel: str) -> Any:
         row[0].set_ylabel(ylabel)
     figure = grid[0, 0].figure
     figure.supxlabel("frames", fontsize=8)
-    shown = enumerate(section.results[:MOST_AGENTS])
-    agents_legend(figure, [(named(result), agent_style(position, result.agent)) for position, result in shown])
+    agents_legend(figure, [(named(result), look) for result, look in _looks(section)])
     return figure
 
 
