@@ -34,7 +34,7 @@ def write_whole(path: str | os.PathLike[str], content: bytes | str, synced: bool
     """
     path = Path(path)
     part = path.with_name(path.name + PART)
-    data = content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content
+    data = _encoded(content)
     try:
         part.unlink(missing_ok=True)
         with part.open("xb") as file:  # a new file, never one that is there, nor a link
@@ -47,6 +47,10 @@ def write_whole(path: str | os.PathLike[str], content: bytes | str, synced: bool
         with suppress(OSError):
             part.unlink(missing_ok=True)
         raise cannot_write(path, len(data), error) from error
+
+
+def _encoded(content: bytes | str) -> bytes:
+    return content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content
 
 
 def is_writable(folder: Path | str) -> bool:
@@ -74,7 +78,7 @@ def write_named(path: Path | str, content: bytes | str) -> None:
     """
     path = Path(path)
     if path.is_symlink() or (path.exists() and not path.is_file()):
-        path.write_bytes(content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content)
+        path.write_bytes(_encoded(content))
     else:
         write_whole(path, content)
 

@@ -52,7 +52,6 @@ ALLOWED = {
     ("ctgraph_rl.runs.on_dask", "Path(sys.argv[1]).write_bytes"): "in a folder of this process",
     ("ctgraph_rl.runs.on_dask", "tempfile.TemporaryDirectory"): "as above",
     ("ctgraph_rl.runs.sweep", "folder.mkdir"): "named by the user",
-    ("ctgraph_rl.runs.job", "folder.mkdir"): "as above",
     ("ctgraph_rl.runs.trackers", "folder.mkdir"): "after a link is refused",
 }
 """Calls outside of `ctgraph_rl.disk`, and why they follow no link of a stranger."""

@@ -61,15 +61,15 @@ def sampled_points(recent: Mapping[str, Tensor], number: int, num_actions: int, 
     return transitions(recent["observation"][drawn], recent["action"][drawn], reward, num_actions)
 
 
-def reference_points(number: int, width: int, seed: int = REFERENCE_SEED) -> Tensor:
+def reference_points(number: int, width: int) -> Tensor:
     """Return uniform points from [0, 1)^n, float32 [M, n], fixed by the arguments."""
-    generator = torch.Generator(device="cpu").manual_seed(seed)
+    generator = torch.Generator(device="cpu").manual_seed(REFERENCE_SEED)
     return torch.rand(number, width, generator=generator, dtype=torch.float32, device="cpu")
 
 
-def unit_directions(number: int, width: int, seed: int = REFERENCE_SEED) -> Tensor:
+def unit_directions(number: int, width: int) -> Tensor:
     """Return uniform directions from the unit sphere, float32 [L, n], fixed by the arguments."""
-    generator = torch.Generator(device="cpu").manual_seed(seed)
+    generator = torch.Generator(device="cpu").manual_seed(REFERENCE_SEED)
     directions = torch.randn(number, width, generator=generator, dtype=torch.float32, device="cpu")
     return normalize(directions, dim=1)
 

@@ -17,6 +17,7 @@ from typing import NamedTuple
 from rich.console import Console
 
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, require
+from ctgraph_rl.disk import require_no_link
 from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.files import CHECKPOINTS, LOG, METRICS
 from ctgraph_rl.log.run_log import RunLog
@@ -144,6 +145,7 @@ def _train(
     failed: Failures = {}
     with Session(console) as session:
         for run_dir in sorted(run_dirs.values()):  # one order, so that no two processes wait for each other
+            require_no_link(run_dir)
             session.lock(run_dir, waiting)
         for group in _groups(curriculum, _untrained(run_dirs)):
             failed |= learn(curriculum, group, session)
