@@ -20,13 +20,18 @@ class Reader(NamedTuple):
 
     weight: Tensor
     bias: Tensor
-    inputs: Tensor
-    """Those of each unit, int64 [units, k]: several for a channel, and for a unit read at several steps."""
+    num_units: int
+    apart: int | None = None
+    """Columns from one input of a unit to its next; None: it has one."""
+
+    within: int | None = None
+    """How many columns are inputs; None: all."""
 
     @property
     def columns(self) -> Tensor:
-        """The inputs, on the device of the weights, which can move."""
-        return self.inputs.to(self.weight.device)
+        """The inputs of each unit, int64 [units, k]: several for a channel, and for a unit read at several steps."""
+        inputs = torch.arange(self.within or self.weight.shape[1], device=self.weight.device)
+        return inputs.view(-1, self.apart or len(inputs))[:, : self.num_units].T
 
 
 class HiddenLayer(NamedTuple):
@@ -44,7 +49,7 @@ class HiddenLayer(NamedTuple):
     @property
     def num_units(self) -> int:
         """Number of units."""
-        return len(self.readers[0].inputs)
+        return self.readers[0].num_units
 
     @property
     def norm(self) -> nn.LayerNorm | None:
@@ -81,7 +86,7 @@ def hidden_layers(policy: nn.Module) -> list[HiddenLayer]:
             read = into_heads if units.reader is None else [(units.reader.weight, units.reader.bias)]
             found.append(_layer(units, read))
         if not inside or inside[-1].reader is not None:
-            readers = [_reader(*each, trunk.cell.num_outputs) for each in into_heads]
+            readers = [Reader(*each, trunk.cell.num_outputs) for each in into_heads]
             found.append(HiddenLayer("memory", None, None, readers))
     else:
         found.append(_layer(chain[-1], into_heads))
@@ -116,8 +121,9 @@ def activations(policy: nn.Module, data: Data) -> Activations:
         else:
             features = trunk.over_time(data).flatten(0, -2)
             of_histories = features.new_full([len(features)], 1 / len(features))
-        for head in _heads(policy, trunk):
-            head(features)
+        if any(layer.name.startswith("head") for layer in layers):
+            for head in _heads(policy, trunk):
+                head(features)
     finally:
         for handle in handles:
             handle.remove()
@@ -127,19 +133,23 @@ def activations(policy: nn.Module, data: Data) -> Activations:
         encoded.append("cell")
     found = {}
     for layer in layers:
-        values = torch.cat(written[layer.name] or [features]).flatten(0, -2)
+        steps = written[layer.name] or [features]
+        values = (steps[0] if len(steps) == 1 else torch.cat(steps)).flatten(0, -2)
         shares = of_inputs if layer.name in encoded else of_histories
         positions = len(values) // len(shares)
-        found[layer.name] = values, (shares / positions).repeat_interleave(positions)
+        if positions > 1:
+            shares = (shares / positions).repeat_interleave(positions)
+        found[layer.name] = values, shares
     return found
 
 
 def _heads(policy: nn.Module, trunk: Any) -> list[nn.Module]:
+    features = trunk.out_keys[0]
     found: list[nn.Module] = []
     for part in policy.modules():
         if isinstance(part, TensorDictModule) and not isinstance(part, TensorDictSequential):
-            reads = trunk.out_keys[0] in part.in_keys
-            found += [part.module] * (reads and isinstance(part.module, nn.Module))
+            if features in part.in_keys and isinstance(part.module, nn.Module):
+                found.append(part.module)
     return found
 
 
@@ -151,15 +161,8 @@ def _layer(
     units: Units, read: Sequence[tuple[Tensor, Tensor]], apart: int | None = None, within: int | None = None
 ) -> HiddenLayer:
     count = units.linear.out_features
-    readers = [_reader(weight, bias, count, apart, within) for weight, bias in read]
+    readers = [Reader(weight, bias, count, apart, within) for weight, bias in read]
     return HiddenLayer(units.name, units.linear, units.activation, readers)
-
-
-def _reader(
-    weight: Tensor, bias: Tensor, num_units: int, apart: int | None = None, within: int | None = None
-) -> Reader:
-    inputs = torch.arange(within or weight.shape[1], device=weight.device)
-    return Reader(weight, bias, inputs.view(-1, apart or len(inputs))[:, :num_units].T)
 
 
 def _keep(values: list[Tensor], module: nn.Module, arguments: Any, output: Tensor) -> None:

@@ -23,7 +23,7 @@ from ctgraph_rl.learn.collect import Policy, make_env, without_ends
 from ctgraph_rl.learn.evaluate import Evaluator, evaluate_together, measure
 from ctgraph_rl.learn.refusals import check_env, check_learner, resumes
 from ctgraph_rl.learn.segments import Segment, announced_id, collect_segment, guided, log_training, segments
-from ctgraph_rl.learn.unit_metrics import EACH_BATCH, UnitMeter, norms, weights_of
+from ctgraph_rl.learn.unit_metrics import EACH_BATCH, UnitMeter, flat_copy, norms
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.tasks.curriculum import Curriculum, Stream
 from ctgraph_rl.tasks.kinds.task_like import close_env
@@ -335,7 +335,8 @@ class Lockstep:
         self.frames += batch.numel() // len(self.logs)
         self.batch = without_ends(batch)
         share = guided(start - segment.start, self.curriculum)
-        before = [weights_of(meter.agent) for meter in self.meters]
+        weights = [list(meter.agent.policy.parameters()) for meter in self.meters]
+        before = [flat_copy(each) for each in weights]
         is_frozen = self.frames > self.last_learned
         learnt: Sequence[Learnt] = [{} for _ in self.logs] if is_frozen else self.group.learn(self.batch)
         logged: list[NamedValues | None] = [None] * len(self.logs)
@@ -350,7 +351,7 @@ class Lockstep:
                 self.failed[number] = FloatingPointError(f"{seed}{error} {where}")
                 continue
             if self.meters:
-                measurements |= norms(self.group.agents[number], before[number], measurements)
+                measurements |= norms(weights[number], before[number], measurements)
             logged[number] = measurements
         self.returns = log_training(self.logs, self.curriculum, batch, start, logged, events=self.events)
         if self.meters and self.meters[0].each_batch:

@@ -7,13 +7,12 @@ zero on a task's few images may serve others.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.utils import parameters_to_vector
 
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import Rule, require
@@ -42,7 +41,7 @@ LayersByName = Mapping[str, tuple[Tensor, Tensor]]
 """By layer, from the inputs to the heads: float [n, H], and each row's share of all, [n]."""
 
 
-def unit_metrics(layers: LayersByName) -> dict[str, float]:
+def unit_metrics(layers: LayersByName, *, complete: bool = False) -> dict[str, float]:
     """Return the metrics of hidden layers: of all units together, and under ``_LAYER`` of each; ranks of the last.
 
     - ``dormant_T``: units with a score of at most T: mean absolute activation over the mean of the layer's units (Sokar
@@ -54,30 +53,35 @@ def unit_metrics(layers: LayersByName) -> dict[str, float]:
 
     All are shares: of units, or of the largest rank, min(n, H).
 
+    Args:
+        complete: whether the rows are all that there are, so that few of them bound the rank in truth.
+
     Raises:
-        ValueError: without a layer.
+        ValueError: without a layer; for fewer rows than the last layer has units, unless they are all.
     """
     require((bool(layers), "metrics of units need a hidden layer, and the network has none"))
-    found = []
-    for values, share in layers.values():
-        sizes = values.detach().double().abs().cpu().numpy()
-        means = share.double().cpu().numpy() @ sizes
-        scores = means / (means.mean() + 1e-9)
-        found.append([*(scores <= threshold for threshold in THRESHOLDS), (sizes == 0).all(axis=0)])
-    names = [*(f"dormant_{threshold:g}" for threshold in THRESHOLDS), "dead"]
-    units = np.concatenate(found, axis=1)
-    values, share = layers[[*layers][-1]]
-    ranks = _ranks(values.detach().double() * share.double().sqrt().unsqueeze(1))
-    measured = {**dict(zip(names, units.mean(axis=1).tolist(), strict=True)), **ranks}
-    for layer, flags in zip(layers, found, strict=True):
-        for name, flag in zip(names, flags, strict=True):
-            measured[f"{name}_{layer}"] = float(flag.mean())
+    last, of_last = layers[[*layers][-1]]
+    least = f"a rank needs at least as many observations as units, {last.shape[1]}, got {len(last)}: show more"
+    require((complete or len(last) >= last.shape[1], least))
+    measured = _ranks(last.detach().cpu().numpy() * np.sqrt(of_last.cpu().numpy(), dtype=np.float64)[:, None])
+    counts = {"": np.zeros(len(THRESHOLDS) + 1)}  # of dormant units and of all, by layer
+    for layer, (values, share) in layers.items():
+        means = share.cpu().numpy() @ values.detach().abs().cpu().numpy()
+        scores = means / (means.sum() / len(means) + 1e-9)
+        dormant = [np.count_nonzero(scores <= threshold) for threshold in THRESHOLDS]
+        counts[f"_{layer}"] = np.array([*dormant, len(means)])
+        counts[""] += counts[f"_{layer}"]
+    for suffix, count in counts.items():
+        shares = (count / count[-1]).tolist()
+        for threshold, dormant in zip(THRESHOLDS, shares[:-1], strict=True):
+            measured[f"dormant_{threshold:g}{suffix}"] = dormant
+        measured[f"dead{suffix}"] = shares[0]
     return measured
 
 
-def _ranks(rows: Tensor) -> dict[str, float]:
-    products = rows.mT @ rows if len(rows) > rows.shape[1] else rows @ rows.mT  # faster than singular values of rows
-    squares = torch.linalg.eigvalsh(products).cpu().numpy()[::-1]
+def _ranks(rows: np.ndarray) -> dict[str, float]:
+    products = rows.T @ rows if len(rows) > rows.shape[1] else rows @ rows.T  # faster than singular values of rows
+    squares = np.linalg.eigvalsh(products)[::-1]
     if squares[0] <= 0:
         return dict.fromkeys(("rank_effective", "rank_srank", "rank_stable"), 0.0)
     squares = np.where(squares > ROUNDING * squares[0], squares, 0.0)
@@ -93,23 +97,25 @@ def _ranks(rows: Tensor) -> dict[str, float]:
     }
 
 
-def norms(agent: Agent, before: Tensor, measurements: Mapping[str, float]) -> dict[str, float]:
+def norms(weights: Sequence[Tensor], before: Tensor, measurements: Mapping[str, float]) -> dict[str, float]:
     """Return the Euclidean norms of all weights, of their change over a batch, and of its mean gradient.
 
     Args:
-        before: the weights before the batch, by `weights_of`.
+        weights: the policy's.
+        before: those before the batch, by `flat_copy`.
         measurements: of the batch; ``grad_norm`` is the norm before it is cut, a mean over gradient steps.
     """
-    after = weights_of(agent)
+    after = flat_copy(weights)
     found = {"norm_weights": after.norm().item(), "norm_updates": (after - before).norm().item()}
     if "grad_norm" in measurements:
         found["norm_gradients"] = measurements["grad_norm"]
     return found
 
 
-def weights_of(agent: Agent) -> Tensor:
-    """Return a copy of the policy's weights, float32 [P]."""
-    return parameters_to_vector(agent.policy.parameters()).detach()
+@torch.no_grad()
+def flat_copy(weights: Sequence[Tensor]) -> Tensor:
+    """Return a copy of weights, one after the other, float32 [P]."""
+    return torch.cat([weight.flatten() for weight in weights])
 
 
 def task_images(task: Task, shape: tuple[int, ...]) -> Tensor:
@@ -124,11 +130,14 @@ def task_images(task: Task, shape: tuple[int, ...]) -> Tensor:
     return ShownTask(task, shape, None).bank.index_select(0, rows)
 
 
-def fresh_images(task: Task) -> Tensor | None:
-    """Return `NUM_FRESH` images of the law of a task's, uint8 [n, *shape]; None for sets that are not drawn."""
+def fresh_images(task: Task, num_units: int) -> Tensor | None:
+    """Return images of the law of a task's, uint8 [n, *shape]; None for sets that are not drawn.
+
+    There are `NUM_FRESH`, or as many as units, whose rank they would bound.
+    """
     if not isinstance(task.images, PaperImages):
         return None
-    return PaperImages(NUM_FRESH, FRESH_SEED, task.images.size).bank(0)
+    return PaperImages(max(NUM_FRESH, num_units), FRESH_SEED, task.images.size).bank(0)
 
 
 def unit_rules(curriculum: Curriculum, agent: Agent, when: bool | str) -> Iterator[Rule]:
@@ -162,7 +171,8 @@ class UnitMeter:
         self.agent = agent
         self.log = log
         self.each_batch = when == EACH_BATCH
-        self._images: tuple[int, dict[str, Tensor]] = (0, {})  # the last block's, by name
+        self._block = 0  # whose images are shown
+        self._num_units = 0  # of the last layer, once it is known
         self._shape = tuple(agent_specs(curriculum).observation["observation"].shape)
 
     def measure(self, block: int, frames: int, moment: str) -> None:
@@ -173,32 +183,40 @@ class UnitMeter:
             frames: of the run so far.
             moment: ``start``, ``during`` or ``end`` of the block, or ``batch``.
         """
-        if self._images[0] != block:
-            self._images = block, self._images_of(block)
-        sets = self._images[1]
-        both = torch.cat([*sets.values()])
-        layers = self._activations(both, self.curriculum.blocks[block - 1].tasks[0])
+        if self._block != block:
+            self._block = block
+            self._show(block)
+        layers = self._activations()
         last = 0
-        for name, images in sets.items():
-            first, last = last, last + len(images)
+        for name, count in self._counts.items():
+            first, last = last, last + count
             of_set = {}
-            for layer, (values, share) in layers.items():
-                rows = slice(first * len(values) // len(both), last * len(values) // len(both))
-                of_set[layer] = values[rows], share[rows] / share[rows].sum()
-            found: dict[str, Any] = {"num_images": len(images), **unit_metrics(of_set)}
-            self.log.append("units", moment=moment, block=block, frames=frames, images=name, **found)
+            for layer, values in layers.items():
+                positions = len(values) // sum(self._counts.values())
+                rows = values[first * positions : last * positions]
+                of_set[layer] = rows, rows.new_full([len(rows)], 1 / len(rows))
+            found = unit_metrics(of_set, complete=name == "task")
+            self.log.append("units", moment=moment, block=block, frames=frames, images=name, num_images=count, **found)
 
-    def _images_of(self, block: int) -> dict[str, Tensor]:
+    def _show(self, block: int) -> None:
         tasks: Any = [*dict.fromkeys(self.curriculum.blocks[block - 1].tasks)]
-        fresh = fresh_images(tasks[0])
-        own = torch.cat([task_images(task, self._shape) for task in tasks]).unique(dim=0)
-        return {"task": own} if fresh is None else {"task": own, "fresh": fresh}
-
-    @torch.no_grad()
-    def _activations(self, images: Tensor, task: Any) -> LayersByName:
-        data = ShownTask(task, self._shape, shown_id(self.curriculum, task)).data(images, True)
         device = next(self.agent.policy.parameters()).device
-        data = {key: value.to(device) for key, value in data.items()}
-        data |= self.agent.initial_state(len(images)).items()
+        shown = ShownTask(tasks[0], self._shape, shown_id(self.curriculum, tasks[0]))
+        sets = {"task": torch.cat([task_images(task, self._shape) for task in tasks]).unique(dim=0)}
+        if not self._num_units:
+            self._data = {key: value.to(device) for key, value in shown.data(sets["task"], True).items()}
+            [*_, last] = self._activations().values()
+            self._num_units = last.shape[1]
+        fresh = fresh_images(tasks[0], self._num_units)
+        if fresh is not None:
+            sets["fresh"] = fresh
+        self._counts = {name: len(images) for name, images in sets.items()}
+        every = shown.data(torch.cat([*sets.values()]), True)
+        self._data = {key: value.to(device) for key, value in every.items()}
+
+    def _activations(self) -> dict[str, Tensor]:
+        """Return the activations at all images shown, by layer."""
+        state = self.agent.initial_state(len(self._data["observation"]))
         learner: Any = getattr(self.agent, "unwrapped", self.agent)
-        return learner.activations(data)
+        found = learner.activations({**self._data, **dict(state.items())})
+        return {layer: values for layer, (values, _) in found.items()}

@@ -42,36 +42,41 @@ def layer(*rows: list[float], shares: list[float] | None = None) -> tuple[Tensor
     return values, torch.full([len(rows)], 1 / len(rows)) if shares is None else torch.tensor(shares)
 
 
+def of_all(layers: dict[str, tuple[Tensor, Tensor]]) -> dict[str, float]:
+    """Metrics of rows that are all that there are."""
+    return unit_metrics(layers, complete=True)
+
+
 def test_a_unit_is_dormant_up_to_a_share_of_its_layers_mean_activation():
     """Scores 0, 0.02, 0.08 and 3.9; the mean of each unit over rows comes before the mean over units."""
-    found = unit_metrics({"a": layer([0, 0.01, 0.08, 0], [0, 0.03, 0.08, 7.8])})
+    found = of_all({"a": layer([0, 0.01, 0.08, 0], [0, 0.03, 0.08, 7.8])})
 
     assert [found[f"dormant_{threshold}"] for threshold in ("0", "0.025", "0.1")] == [0.25, 0.5, 0.75]
 
 
 def test_a_score_is_no_mean_over_rows_of_shares_of_a_row():
     """In the quiet row the first unit has half of all; by rows its score would be 0.505."""
-    found = unit_metrics({"a": layer([0.001, 0.001], [0.0, 100.0])})
+    found = of_all({"a": layer([0.001, 0.001], [0.0, 100.0])})
 
     assert found["dormant_0.025"] == 0.5
 
 
 def test_dead_units_are_zero_in_all_rows_and_no_share_of_zero_entries():
     """Five of eight entries are 0, and one of four units is dead."""
-    found = unit_metrics({"a": layer([0, 1, 0, 0], [0, 0, 1, 1])})
+    found = of_all({"a": layer([0, 1, 0, 0], [0, 0, 1, 1])})
 
     assert found["dead"] == 0.25
 
 
 def test_negative_activations_are_not_dead_and_do_not_cancel():
-    found = unit_metrics({"a": layer([-1, 1], [1, 1])})
+    found = of_all({"a": layer([-1, 1], [1, 1])})
 
     assert (found["dead"], found["dormant_0.1"]) == (0, 0)
 
 
 def test_a_total_counts_units_and_is_no_mean_of_layers():
     """One of two units and none of six: an eighth, where the mean of layers is a quarter."""
-    found = unit_metrics({"a": layer([0, 1]), "b": layer([1] * 6)})
+    found = of_all({"a": layer([0, 1]), "b": layer([1] * 6)})
 
     assert (found["dead"], found["dead_a"], found["dead_b"]) == (0.125, 0.5, 0)
     assert found["dormant_0"] == 0.125
@@ -81,13 +86,13 @@ def test_rows_count_by_their_shares():
     """The unit is on in a row that stands for 1 % of frames; equal weights would give it the score 1."""
     rare = layer([1.0, 1.0], [0.0, 1.0], shares=[0.01, 0.99])
 
-    assert unit_metrics({"a": rare})["dormant_0.025"] == 0.5
-    assert unit_metrics({"a": layer([1.0, 1.0], [0.0, 1.0])})["dormant_0.1"] == 0
+    assert of_all({"a": rare})["dormant_0.025"] == 0.5
+    assert of_all({"a": layer([1.0, 1.0], [0.0, 1.0])})["dormant_0.1"] == 0
 
 
 def test_ranks_of_orthogonal_rows_are_full_and_of_equal_rows_one():
-    full = unit_metrics({"a": layer(*torch.eye(4).tolist())})
-    one = unit_metrics({"a": layer(*[[1.0, 2.0, 3.0, 4.0]] * 4)})
+    full = of_all({"a": layer(*torch.eye(4).tolist())})
+    one = of_all({"a": layer(*[[1.0, 2.0, 3.0, 4.0]] * 4)})
 
     for name in ("rank_effective", "rank_srank", "rank_stable"):
         assert full[name] == pytest.approx(1, abs=1e-9)
@@ -95,7 +100,7 @@ def test_ranks_of_orthogonal_rows_are_full_and_of_equal_rows_one():
 
 
 def test_a_rank_is_a_share_of_the_images_where_they_are_fewer_than_units():
-    found = unit_metrics({"a": layer([1, 0, 0, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0, 0, 0])})
+    found = of_all({"a": layer([1, 0, 0, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0, 0, 0])})
 
     assert found["rank_effective"] == pytest.approx(1)
     assert found["rank_srank"] == found["rank_stable"] == 1
@@ -103,8 +108,8 @@ def test_a_rank_is_a_share_of_the_images_where_they_are_fewer_than_units():
 
 def test_equal_rows_change_no_rank_where_they_share_a_weight():
     """A row of half of all, twice as two quarters; unweighted, the singular values would differ."""
-    once = unit_metrics({"a": layer([1.0, 0.0], [0.0, 1.0])})
-    twice = unit_metrics({"a": layer([1.0, 0.0], [0.0, 1.0], [0.0, 1.0], shares=[0.5, 0.25, 0.25])})
+    once = of_all({"a": layer([1.0, 0.0], [0.0, 1.0])})
+    twice = of_all({"a": layer([1.0, 0.0], [0.0, 1.0], [0.0, 1.0], shares=[0.5, 0.25, 0.25])})
 
     for name in ("rank_effective", "rank_stable"):
         assert twice[name] == pytest.approx(once[name])
@@ -113,7 +118,7 @@ def test_equal_rows_change_no_rank_where_they_share_a_weight():
 def test_three_ranks_of_the_same_singular_values_differ_as_defined():
     """Singular values 3, 1, 0.03, 0: srank sums them, not their squares; only the stable rank squares them."""
     sigma = [3.0, 1.0, 0.05, 0.0]
-    found = unit_metrics({"a": layer(*torch.diag(torch.tensor(sigma)).tolist())})
+    found = of_all({"a": layer(*torch.diag(torch.tensor(sigma)).tolist())})
 
     shares = [value / 4.05 for value in sigma[:3]]
     assert found["rank_effective"] == pytest.approx(math.exp(-sum(p * math.log(p) for p in shares)) / 4, abs=1e-6)
@@ -123,14 +128,14 @@ def test_three_ranks_of_the_same_singular_values_differ_as_defined():
 
 def test_ranks_do_not_change_with_scale_and_those_of_a_dead_layer_are_0():
     values, share = layer([3, 1, 2], [1, 5, 1])
-    small = unit_metrics({"a": (1e-3 * values, share)})
+    small = of_all({"a": (1e-3 * values, share)})
 
-    assert small["rank_effective"] == pytest.approx(unit_metrics({"a": (values, share)})["rank_effective"])
-    assert unit_metrics({"a": (0 * values, share)})["rank_stable"] == 0
+    assert small["rank_effective"] == pytest.approx(of_all({"a": (values, share)})["rank_effective"])
+    assert of_all({"a": (0 * values, share)})["rank_stable"] == 0
 
 
 def test_a_rank_is_that_of_the_last_layer():
-    found = unit_metrics({"a": layer([1, 0], [0, 1]), "b": layer([1, 1], [1, 1])})
+    found = of_all({"a": layer([1, 0], [0, 1]), "b": layer([1, 1], [1, 1])})
 
     assert found["rank_effective"] == pytest.approx(0.5)
 
@@ -140,6 +145,14 @@ def test_metrics_of_no_layer_are_refused():
         unit_metrics({})
 
 
+def test_a_rank_of_fewer_observations_than_units_is_refused_unless_they_are_all():
+    with pytest.raises(ValueError, match="a rank needs at least as many observations as units, 3, got 2: show more"):
+        unit_metrics({"a": layer([1, 0], [0, 1]), "b": layer([1, 0, 0], [0, 1, 0])})
+
+    assert unit_metrics({"a": layer([1, 0, 0]), "b": layer([1, 0], [0, 1])})["rank_stable"] == 1
+    assert of_all({"b": layer([1, 0, 0], [0, 1, 0])})["rank_stable"] == 1
+
+
 def test_norms_are_of_all_weights_of_their_change_and_of_the_gradient_before_it_is_cut():
     policy = torch.nn.Linear(2, 1)
     with torch.no_grad():
@@ -147,7 +160,7 @@ def test_norms_are_of_all_weights_of_their_change_and_of_the_gradient_before_it_
         policy.bias.fill_(12.0)
     before = torch.tensor([0.0, 4.0, 8.0])
 
-    found = norms(SimpleNamespace(policy=policy), before, {"grad_norm": 7.0})
+    found = norms([*policy.parameters()], before, {"grad_norm": 7.0})
 
     assert found == {"norm_weights": 13.0, "norm_updates": 5.0, "norm_gradients": 7.0}
 
@@ -165,27 +178,28 @@ def test_images_of_a_task_are_those_of_its_states_each_once(task, count):
 def test_fresh_images_are_no_images_of_the_task_and_missing_where_none_can_be_drawn():
     task = ct_fo_b1()
 
-    fresh = fresh_images(task)
+    fresh = fresh_images(task, 64)
 
     both = torch.cat([fresh, task_images(task, (1, 12, 12))])
     assert len(fresh) == NUM_FRESH
     assert len(both.unique(dim=0)) == len(both)
-    assert fresh_images(SimpleNamespace(images=OneHot(8))) is None
+    assert fresh_images(SimpleNamespace(images=OneHot(8)), 64) is None
 
 
 class Zeros:
-    """A learner with two units, which are on at no image and on at all images."""
+    """A learner with as many units that are on at no image as units that are on at all images."""
 
     num_envs, num_steps = 4, 2
 
-    def __init__(self) -> None:
+    def __init__(self, num_zero: int = 1) -> None:
         self.policy = torch.nn.Linear(1, 1)
+        self.num_zero = num_zero
 
     def initial_state(self, number):
         return {}
 
     def activations(self, data):
-        ones = torch.ones(len(data["observation"]), 1)
+        ones = torch.ones(len(data["observation"]), self.num_zero)
         return {"only": (torch.cat([0 * ones, ones], dim=1), ones[:, 0] / len(ones))}
 
 
@@ -215,6 +229,15 @@ def test_a_meter_appends_a_line_for_task_images_and_one_for_fresh_ones():
         "frames": 8,
         "moment": "start",
     }
+
+
+def test_a_last_layer_of_300_units_is_shown_300_fresh_images():
+    """Fewer would bound its rank."""
+    log = RunLog()
+
+    UnitMeter(SHORT, Zeros(150), log, True).measure(1, 0, "start")
+
+    assert [line["num_images"] for line in log.measurements] == [16, 300]
 
 
 SHORT = replace(
