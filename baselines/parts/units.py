@@ -144,12 +144,11 @@ def activations(policy: nn.Module, data: Data) -> Activations:
 
 
 def _heads(policy: nn.Module, trunk: Any) -> list[nn.Module]:
-    features = trunk.out_keys[0]
     found: list[nn.Module] = []
     for part in policy.modules():
         if isinstance(part, TensorDictModule) and not isinstance(part, TensorDictSequential):
-            if features in part.in_keys and isinstance(part.module, nn.Module):
-                found.append(part.module)
+            reads = trunk.out_keys[0] in part.in_keys
+            found += [part.module] * (reads and isinstance(part.module, nn.Module))
     return found
 
 

@@ -231,6 +231,26 @@ def test_a_meter_appends_a_line_for_task_images_and_one_for_fresh_ones():
     }
 
 
+def test_a_block_is_measured_on_its_images_with_all_places_of_a_channel():
+    """The channel is on at the second place of the last image of block 2."""
+    tasks = (ct_fo_b1(image_seed=1), ct_fo_b1(image_seed=2))
+    last = task_images(tasks[1], (1, 12, 12)).unique(dim=0)[-1]
+    agent = Zeros()
+
+    def activations(data):
+        is_last = (data["observation"] == last).flatten(1).all(dim=1).float()
+        places = torch.stack([0 * is_last, is_last], dim=1).view(-1, 1)
+        return {"channel": (places, torch.full([len(places)], 1 / len(places)))}
+
+    agent.activations = activations
+    log = RunLog()
+    meter = UnitMeter(Curriculum("mine", 1, "", tuple(Block(task, 8) for task in tasks)), agent, log, True)
+    meter.measure(1, 0, "start")
+    meter.measure(2, 8, "start")
+
+    assert [line["dead"] for line in log.measurements] == [1, 1, 0, 1]
+
+
 def test_a_last_layer_of_300_units_is_shown_300_fresh_images():
     """Fewer would bound its rank."""
     log = RunLog()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from statistics import fmean
+from statistics import fmean, linear_regression
 
 import numpy as np
 from scipy.stats import rankdata
@@ -22,11 +22,8 @@ ALPHA = 0.05
 CONFLICT = "goal_conflict"
 STREAM = "stream"
 
-COMPARED = {CONFLICT: range(2, 3), STREAM: range(2, 11)}
-"""Blocks after a change that all seeds have."""
-
-LATE = range(11, 31)
-"""Blocks of a stream that fewer seeds have."""
+COMPARED = {CONFLICT: range(2, 3), STREAM: range(2, 31)}
+"""Blocks after a change."""
 
 NINE = {
     "layer_norm": "layer norm",
@@ -55,9 +52,9 @@ COLUMNS = [f"{name}_{images}" for name in METRICS for images in ("task", "fresh"
 RESAMPLES = 4000
 
 
-def later_blocks(curriculum: str, condition: str, blocks: range | None = None) -> dict[str, Raw]:
-    """Return the lines of blocks, those of `COMPARED` unless given, by seed."""
-    wanted = COMPARED[curriculum] if blocks is None else blocks
+def later_blocks(curriculum: str, condition: str) -> dict[str, Raw]:
+    """Return the lines of the blocks in `COMPARED` by seed."""
+    wanted = COMPARED[curriculum]
     lines = []
     for line in read(NAME):
         if line["condition"] == condition and line["curriculum"] == curriculum and int(line["block"]) in wanted:
@@ -70,13 +67,25 @@ def area(lines: Raw) -> float:
     return fmean(float(line["area"]) for line in lines)
 
 
-def compared(curriculum: str, first: str, second: str, blocks: range | None = None) -> Comparison:
+def compared(curriculum: str, first: str, second: str) -> Comparison:
     """Compare the areas of two conditions, paired by seed."""
-    ours = later_blocks(curriculum, first, blocks)
-    theirs = later_blocks(curriculum, second, blocks)
+    ours = later_blocks(curriculum, first)
+    theirs = later_blocks(curriculum, second)
     seeds = [seed for seed in ours if seed in theirs]
     first_areas = [area(ours[seed]) for seed in seeds]
     return statistics.compare(first_areas, [area(theirs[seed]) for seed in seeds])
+
+
+def growth() -> Comparison:
+    """Compare how a fresh network's and fine-tuning's area change over ten blocks of a stream, by least squares."""
+    slopes = []
+    for condition in ("fresh", "none"):
+        of_seeds = []
+        for lines in later_blocks(STREAM, condition).values():
+            blocks = [int(line["block"]) for line in lines]
+            of_seeds.append(10 * linear_regression(blocks, [float(line["area"]) for line in lines]).slope)
+        slopes.append(of_seeds)
+    return statistics.compare(*slopes)
 
 
 def nine_against(curriculum: str, other: str) -> dict[str, Comparison]:
@@ -151,41 +160,41 @@ def _areas(lines: Raw) -> dict[str, list[float]]:
 def forecasts(curriculum: str) -> Mapping[str, tuple[float, float, float]]:
     """Return each metric's rank correlation with the area after the change, and its interval.
 
-    Ranks are within conditions; seeds are drawn with replacement, and all of [-1, 1] is the interval of fewer than
-    `LEAST_FOR_BOOTSTRAP`. Intervals are corrected by Bonferroni.
+    Ranks are within conditions and blocks, as both change over a life. Seeds are drawn with replacement, and all of
+    [-1, 1] is the interval of fewer than `LEAST_FOR_BOOTSTRAP`. Intervals are corrected by Bonferroni.
     """
-    by_condition = []
+    cells: list[Raw] = []
     for condition in LABELS:
         lines = [line for of_seed in later_blocks(curriculum, condition).values() for line in of_seed]
-        if lines and condition != "fresh":
-            by_condition.append(lines)
-    seeds = [int(line["seed"]) for lines in by_condition for line in lines]
+        if condition != "fresh":
+            cells += groups(lines, "block").values()
+    seeds = [line["seed"] for lines in cells for line in lines]
     positions = np.unique(seeds, return_inverse=True)[1]
-    areas = _centred(by_condition, "area")
-    counts = np.random.default_rng(0).multinomial(
-        positions.max() + 1, np.full(positions.max() + 1, 1 / (positions.max() + 1)), RESAMPLES
-    )
-    weights = np.concatenate([np.ones((1, len(seeds))), counts[:, positions]])
+    count = positions.max() + 1
+    draws = np.random.default_rng(0).multinomial(count, np.full(count, 1 / count), RESAMPLES)
+    weights = np.concatenate([np.ones((1, count)), draws])
+
+    def total(products: np.ndarray) -> np.ndarray:
+        return weights @ np.bincount(positions, products)
+
+    areas = _centred(cells, "area")
+    tail = ALPHA / len(COLUMNS) / 2
     found = {}
     for column in COLUMNS:
-        values = _centred(by_condition, column)
-        scale = np.sqrt((weights @ values**2) * (weights @ areas**2))
-        correlations = (weights @ (values * areas)) / np.where(scale > 0, scale, np.inf)
-        tail = ALPHA / len(COLUMNS) / 2
-        low, high = (
-            np.quantile(correlations[1:], [tail, 1 - tail]) if len(counts[0]) >= LEAST_FOR_BOOTSTRAP else (-1, 1)
-        )
+        values = _centred(cells, column)
+        scale = np.sqrt(total(values**2) * total(areas**2))
+        correlations = total(values * areas) / np.where(scale > 0, scale, np.inf)
+        low, high = np.quantile(correlations[1:], [tail, 1 - tail]) if count >= LEAST_FOR_BOOTSTRAP else (-1, 1)
         found[column] = (float(correlations[0]), float(low), float(high))
     return found
 
 
-def _centred(by_condition: list[Raw], column: str) -> np.ndarray:
-    """Return ranks within each condition, less their mean, as shares of the condition's lines."""
-    parts = []
-    for lines in by_condition:
-        ranks = rankdata([float(line[column]) for line in lines])
-        parts.append((ranks - (len(lines) + 1) / 2) / len(lines))
-    return np.concatenate(parts)
+def _centred(cells: list[Raw], column: str) -> np.ndarray:
+    """Return ranks within each cell, less their mean, as shares of the cell's lines."""
+    values = np.array([[float(line[column]) for line in lines] for lines in cells])
+    ranks = rankdata(values, axis=1)
+    count = ranks.shape[1]
+    return ((ranks - (count + 1) / 2) / count).ravel()
 
 
 def forecast_words(curriculum: str) -> str:
@@ -223,8 +232,7 @@ def page() -> str:
         "conditions": conditions_table(),
         "conflict_seeds": len(later_blocks(CONFLICT, "none")),
         "stream_seeds": len(later_blocks(STREAM, "none")),
-        "late_seeds": len(later_blocks(STREAM, "none", LATE)),
-        "loss_late": shown(compared(STREAM, "fresh", "none", LATE).difference),
+        "growth": shown(growth().difference),
         "loss_conflict": shown(compared(CONFLICT, "fresh", "none").difference),
         "loss_stream": shown(compared(STREAM, "fresh", "none").difference),
         "matched": matched_words(),
