@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from statistics import fmean
 
 import torch
 from torch import Tensor
@@ -125,33 +126,31 @@ def by_windows(log: RunLog) -> RunLog:
     Evaluations are means over a window's tasks at their blocks' ends, training those of up to `PARTS` parts.
     """
     ends: dict[int, NamedValues] = {}
-    for m in log.of_kind("evaluation"):
-        if m.get("moment") != "during":
-            ends.setdefault(m["block"], m)  # the first of a block is of the task that it trains
     training: dict[int, list[NamedValues]] = {}
-    for m in log.of_kind("training"):
-        training.setdefault(m["block"], []).append(m)
+    for m in log.measurements:
+        if m["kind"] == "training":
+            training.setdefault(m["block"], []).append(m)
+        elif m["kind"] == "evaluation" and m.get("moment") != "during":
+            ends.setdefault(m["block"], m)  # the first of a block is of the task that it trains
     about = log.of_kind("run")[0]
     count = about["life"] if tuning_share(about) is None else max(ends, default=0)
-    labels = []
-    lines = [{**ends[0], "label": ""}] if 0 in ends else []
     blocks = torch.arange(1, max(count, 1) + 1, device="cpu")
-    for number, window in enumerate(blocks.tensor_split(min(NUM_WINDOWS, len(blocks))), 1):
-        first, last = window[0].item(), window[-1].item()
-        labels.append(f"tasks {first:,}-{last:,}" if last > first else f"task {first:,}")
-        for part in window.tensor_split(min(PARTS, len(window))):
-            own = [m for block in part.tolist() for m in training.get(block, ())]
-            if own:
-                lines.append({"kind": "training", "block": number, **_mean_line(own)})
-        at_end = [ends[block] for block in window.tolist() if block in ends]
-        if at_end:
-            place = {"kind": "evaluation", "moment": "after", "block": number, "task": number, "held_out": False}
-            lines.append({**place, **_mean_line(at_end)})
+    windows = [window.tolist() for window in blocks.tensor_split(min(NUM_WINDOWS, len(blocks)))]
+    labels = [f"tasks {own[0]:,}-{own[-1]:,}" if len(own) > 1 else f"task {own[0]:,}" for own in windows]
     found = RunLog()
     found.torn_lines = log.torn_lines
     found.measurements = [{**about, "tasks": labels, "trained": [[number] for number in range(1, len(labels) + 1)]}]
-    for line in lines:
-        found.measurements.append({**line, "label": labels[line.get("task", 1) - 1]})
+    if 0 in ends:
+        found.measurements.append({**ends[0], "label": labels[0]})
+    for number, window in enumerate(windows, 1):
+        for part in torch.tensor(window, device="cpu").tensor_split(min(PARTS, len(window))):
+            own = [m for block in part.tolist() for m in training.get(block, ())]
+            if own:
+                found.measurements.append({"kind": "training", "block": number, **_mean_line(own)})
+        at_end = [ends[block] for block in window if block in ends]
+        if at_end:
+            place = {"moment": "after", "block": number, "task": number, "label": labels[number - 1], "held_out": False}
+            found.measurements.append({"kind": "evaluation", **place, **_mean_line(at_end)})
     return found
 
 
@@ -159,7 +158,7 @@ def _mean_line(lines: Sequence[NamedValues]) -> NamedValues:
     line: NamedValues = {"frames": lines[-1]["frames"], "seconds": lines[-1].get("seconds", 0.0)}
     for name in ("return_mean", "success_rate", "end_rate", "length_mean"):
         known = [m for m in lines if m.get(name) is not None]
-        weight = sum(m.get("episodes") or 1 for m in known)
-        line[name] = sum(m[name] * (m.get("episodes") or 1) for m in known) / weight if known else None
+        weights = [m.get("episodes") or 1 for m in known]
+        line[name] = fmean([m[name] for m in known], weights) if known else None
     line["episodes"] = sum(m.get("episodes") or 0 for m in lines) or None
     return line
