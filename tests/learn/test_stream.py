@@ -126,7 +126,7 @@ def test_an_agent_that_does_not_learn_has_no_jump_start_and_equal_returns():
 
 @pytest.mark.parametrize("boundaries", [pytest.param("announced", marks=pytest.mark.slow), "hidden"])
 def test_a_resumed_life_ends_with_the_same_weights(boundaries, tmp_path):
-    life = stream({"every": 0}, {"boundaries": boundaries}, num_frames=80)
+    life = stream({"every": 0}, {"boundaries": boundaries}, num_tasks=3, num_frames=80)
 
     logs = logs_of_equal_ends(life, lambda: learner(life), tmp_path)
 

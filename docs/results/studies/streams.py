@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
 
 from ctgraph_rl.draw.style import new_figure, save_figure
-from studies.raw import Raw, fill, groups, machines, mean_of, read, table
+from studies.raw import Raw, fill, groups, machines, mean_of, read, select, shown, table
 from studies.verdicts import Effect
 
 NAME = "streams"
@@ -20,8 +21,14 @@ METHODS = {
     "mask_ri": "Mask RI",
     "scratch": "new weights",
 }
+K = {"first_tenth": "", "whole_life": ", k = 100"}
 NUM_WINDOWS = 10
 SHARES = (0.0, 1.0)
+
+TUNED_BY = ("100", "101")
+"""Seeds whose trials chose the rates of all lives."""
+
+EWC_OF_ALL = "EWC: more than fine-tuned, k = 100"
 
 LESS = 0.1
 """Of a share of tasks, the smallest difference that counts."""
@@ -32,34 +39,27 @@ def runs() -> dict[tuple[str, ...], Raw]:
     return groups([line for line in read(NAME) if line["k"] == "10"], "agent", "method")
 
 
-def trials() -> dict[tuple[str, ...], Raw]:
-    """Return the tuning runs over whole lives by method and learning rate."""
-    return groups(read(TRIALS), "method", "learning_rate")
-
-
-def chosen(method: str, part: str) -> str:
+def chosen(agent: str, method: str, part: str, seeds: Sequence[str] = TUNED_BY) -> str:
     """Return the learning rate with the largest mean return in ``first_tenth`` or ``whole_life``."""
-    means = {}
-    for (name, rate), lines in trials().items():
-        if name == method:
-            means[rate] = fmean(float(line[part]) for line in lines)
-    return max(means, key=lambda rate: means[rate])
+    own = [line for line in select(read(TRIALS), agent=agent, method=method) if line["seed"] in seeds]
+    by_rate = groups(own, "learning_rate")
+    [rate] = max(by_rate, key=lambda rate: _mean(by_rate[rate], part))
+    return rate
+
+
+def _mean(lines: Raw, column: str) -> float:
+    return fmean(float(line[column]) for line in lines if line[column])
 
 
 def tuned_on_all(method: str) -> Raw:
     """Return PPO's lines of all seeds with the rate that the whole life chooses."""
-    wanted = ("ppo", method, chosen(method, "whole_life"))
+    wanted = ("ppo", method, chosen("ppo", method, "whole_life"))
     return [line for line in read(NAME) if (line["agent"], line["method"], line["learning_rate"]) == wanted]
 
 
 def solved(line: dict[str, str]) -> list[float]:
     """Return the share of tasks solved at the end of their blocks in each window."""
     return [float(line[f"solved_{window}"]) for window in range(1, NUM_WINDOWS + 1)]
-
-
-def mean_of_known(lines: Raw, column: str) -> str:
-    """Return the mean of a metric over the seeds in which it is defined."""
-    return f"{fmean(float(line[column]) for line in lines if line[column]):.2f}"
 
 
 def table_of_runs() -> str:
@@ -71,33 +71,32 @@ def table_of_runs() -> str:
             named[f"{AGENTS[agent]}, {METHODS[method]}"] = lines
     named["PPO, fine-tuned, k = 100"] = tuned_on_all("finetune")
     for name, lines in named.items():
-        per_frame = [float(line["frame_regret"]) / frames(line) for line in lines]
-        seconds = [float(line["cpu_seconds"]) / int(line["num_tasks"]) for line in lines if line["cpu_seconds"]]
+        per_frame = _mean(lines, "frame_regret") / frames(lines[0])
+        seconds = _mean(lines, "cpu_seconds") / int(lines[0]["num_tasks"])
         rows.append(
             [
                 name,
-                str(len(lines)),
                 mean_of([fmean(solved(line)) for line in lines], SHARES),
-                f"{fmean(solved(line)[0] for line in lines):.2f}",
                 f"{fmean(solved(line)[-1] for line in lines):.2f}",
-                mean_of_known(lines, "retention_1"),
-                mean_of_known(lines, "retention_10"),
-                f"{fmean(per_frame):.3f}",
-                f"{fmean(seconds):.1f}" if seconds else "-",
+                f"{_mean(lines, 'retention_1'):.2f}",
+                f"{_mean(lines, 'retention_10'):.2f}",
+                f"{per_frame:.3f}",
+                f"{seconds:.1f}",
             ]
         )
-    head = ["learner", "seeds", "solved", "first window", "last window", "kept after 1", "after 10", "regret per frame"]
+    head = ["learner", "solved", "last window", "kept after 1", "after 10", "regret per frame"]
     return table([*head, "CPU seconds a task"], rows)
 
 
 def table_of_trials() -> str:
-    """Return a row for each learning rate: the objective of tuning runs on both parts of a life."""
-    rows: dict[str, list[str]] = {}
-    for (_, rate), lines in trials().items():
-        for part in ("first_tenth", "whole_life"):
-            rows.setdefault(rate, [rate]).append(f"{fmean(float(line[part]) for line in lines):.3f}")
-    head = [f"{METHODS[method]}, k = {k}" for method in ("finetune", "ewc") for k in (10, 100)]
-    return table(["rate", *head], list(rows.values()))
+    """Return a row for each learner that was tuned, on both parts of a life: the objective by learning rate."""
+    rows = []
+    for part in K:
+        for (agent, method), lines in groups(read(TRIALS), "agent", "method").items():
+            if lines[0][part]:
+                means = [f"{_mean(of_rate, part):.3f}" for of_rate in groups(lines, "learning_rate").values()]
+                rows.append([f"{AGENTS[agent]}, {METHODS[method]}{K[part]}", *means])
+    return table(["learner", "0.001", "0.003", "0.01"], rows)
 
 
 def frames(line: dict[str, str]) -> int:
@@ -105,24 +104,29 @@ def frames(line: dict[str, str]) -> int:
     return int(line["num_tasks"]) * int(line["num_frames"])
 
 
-def claims() -> str:
-    """Return a row for each sentence with its verdict."""
+def claims() -> dict[tuple[str, str], Effect]:
+    """Return the effect in the direction of each sentence on an agent, with a value for each seed."""
     found = runs()
-    rows = []
-    for agent, name in AGENTS.items():
-        losses = [solved(line)[0] - solved(line)[-1] for line in found.get((agent, "finetune"), [])]
-        rows.append(_claim(f"{name}, fine-tuned, solves fewer of the last tasks than of the first", losses))
-        for method in ("ewc", "mask_ri", "scratch"):
-            gains = _gains(found.get((agent, method), []), found.get((agent, "finetune"), []))
-            rows.append(_claim(f"{name} solves more tasks with {METHODS[method]} than fine-tuned", gains))
-        on = _gains(found.get((agent, "finetune"), []), found.get((agent, "frozen"), []))
-        rows.append(_claim(f"{name}, fine-tuned, solves more tasks than frozen", on))
+    values = {}
+    for (agent, method), lines in found.items():
+        if method == "finetune":
+            losses = [solved(line)[0] - solved(line)[-1] for line in lines]
+            values["fine-tuned: fewer of the last ten than of the first", agent] = losses
+        else:
+            values[f"{METHODS[method]}: more than fine-tuned", agent] = _gains(lines, found[agent, "finetune"])
     whole = tuned_on_all("finetune")
-    longer = _gains(whole, found["ppo", "finetune"])
-    rows.append(_claim("PPO, fine-tuned, solves more tasks if tuned on the whole life than on a tenth", longer))
-    more = _gains(whole, tuned_on_all("ewc"))
-    rows.append(_claim("PPO, tuned on the whole life, solves more tasks fine-tuned than with EWC", more))
-    return table(["sentence", "difference", "verdict"], [row for row in rows if row])
+    values["fine-tuned: more with k = 100 than with k = 10", "ppo"] = _gains(whole, found["ppo", "finetune"])
+    values[EWC_OF_ALL, "ppo"] = _gains(tuned_on_all("ewc"), whole)
+    return {sentence: Effect(own, LESS, room=1.0) for sentence, own in values.items()}
+
+
+def table_of_claims(effects: Mapping[tuple[str, str], Effect]) -> str:
+    """Return a row for each sentence: the difference by agent."""
+    rows = []
+    for sentence in dict.fromkeys(sentence for sentence, _ in effects):
+        known = [effects.get((sentence, agent)) for agent in AGENTS]
+        rows.append([sentence, *("" if effect is None else shown(effect.estimate) for effect in known)])
+    return table(["tasks solved", *AGENTS.values()], rows)
 
 
 def counts() -> dict[str, str]:
@@ -144,11 +148,6 @@ def _gains(lines: Raw, others: Raw) -> list[float]:
 def tasks_solved(lines: Raw) -> str:
     """Return how many of a hundred tasks were solved, the mean over seeds."""
     return f"{100 * fmean(fmean(solved(line)) for line in lines):.0f}"
-
-
-def _claim(sentence: str, values: list[float]) -> list[str]:
-    effect = Effect(values, LESS, room=1.0)
-    return [sentence, mean_of(values, effect.bounds), effect.verdict] if len(values) > 1 else []
 
 
 def draw(folder: Path) -> None:
@@ -176,14 +175,17 @@ def draw(folder: Path) -> None:
 def page() -> str:
     """Return the page."""
     lines = read(NAME)
+    effects = claims()
     rates = {AGENTS[line["agent"]]: line["learning_rate"] for line in lines if line["k"] == "10"}
     texts = {
         "table": table_of_runs(),
         "trials": table_of_trials(),
-        "whole_finetune": chosen("finetune", "whole_life"),
+        "whole_finetune": chosen("ppo", "finetune", "whole_life"),
         "ppo_whole": tasks_solved(tuned_on_all("finetune")),
         "ewc_whole": tasks_solved(tuned_on_all("ewc")),
-        "claims": claims(),
+        "claims": table_of_claims(effects),
+        "lead_10": shown(effects["EWC: more than fine-tuned", "ppo"].estimate),
+        "lead_100": shown(effects[EWC_OF_ALL, "ppo"].estimate),
         "rates": ", ".join(f"{name} {rate}" for name, rate in rates.items()),
         "frames": f"{int(lines[0]['num_frames']):,}",
         "machines": machines(NAME),

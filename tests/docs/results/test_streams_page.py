@@ -45,13 +45,40 @@ def test_regret_and_solved_tasks_are_those_of_one_life(streams):
 
 
 def test_settings_are_those_that_a_part_of_the_life_chooses(streams):
-    shared = {line["agent"]: line["learning_rate"] for lines in streams.runs().values() for line in lines}
+    lines = streams.read(streams.NAME)
+    every = ("100", "101", "102")
 
-    assert streams.chosen("finetune", "first_tenth") == shared["ppo"] == "0.01"
-    assert streams.chosen("ewc", "whole_life") == "0.01"
-    assert {line["learning_rate"] for line in streams.read(streams.NAME) if line["k"] == "100"} == {
-        streams.chosen("finetune", "whole_life")
-    }
+    def own(agent, method, part="first_tenth"):
+        return streams.chosen(agent, method, part, every)
+
+    for (agent, _), of_learner in streams.runs().items():
+        assert {line["learning_rate"] for line in of_learner} == {streams.chosen(agent, "finetune", "first_tenth")}
+    assert {line["learning_rate"] for line in lines if line["k"] == "100"} == {own("ppo", "finetune", "whole_life")}
+    assert streams.chosen("ppo", "ewc", "whole_life") == own("ppo", "ewc") == own("ppo", "ewc", "whole_life") == "0.01"
+    assert [own(agent, "finetune") for agent in streams.AGENTS] == ["0.01", "0.01", "0.001"]
+    assert [own("ppo", "mask_ri"), own("ppo", "scratch"), own("dqn", "scratch")] == ["0.003", "0.003", "0.001"]
+    trials = streams.groups(streams.read(streams.TRIALS), "agent", "method", "learning_rate")
+    assert {tuple(line["seed"] for line in lines) for lines in trials.values()} == {every}
+
+
+def test_what_the_page_says_in_bold_is_what_was_found(streams):
+    solved = {name: float(count) for name, count in streams.counts().items()}
+    effects = streams.claims()
+    whole = effects[streams.EWC_OF_ALL, "ppo"].estimate.value
+
+    for agent in ("ppo", "dqn"):
+        assert solved[f"{agent}_finetune_last"] <= solved[f"{agent}_finetune_first"] - 4
+    for agent in streams.AGENTS:
+        assert solved[f"{agent}_scratch"] >= 90
+        assert solved[f"{agent}_ewc"] < solved[f"{agent}_finetune"]
+    assert streams.chosen("ppo", "finetune", "first_tenth") != streams.chosen("ppo", "finetune", "whole_life")
+    assert whole < effects["EWC: more than fine-tuned", "ppo"].estimate.value < 0
+    assert solved["dqn_finetune"] > 4 * solved["dqn_frozen"]
+    assert abs(effects["frozen: more than fine-tuned", "ppo"].estimate.value) < streams.LESS
+    assert {effect.verdict for effect in effects.values()} == {"cannot be said"}
+    assert {len(effect.values) for effect in effects.values()} == {5}
+    needed = [effect.seeds for effect in effects.values()]
+    assert (min(needed), max(needed)) == (39, 69)
 
 
 def test_regret_per_frame_of_policies_without_learning_is_in_the_text(streams):
