@@ -347,6 +347,7 @@ def test_processes_and_threads_together_use_no_more_than_the_cores(num_threads, 
     sweeper.setup(hydra_context=None, task_function=None, config=cfg)
 
     assert [each.hydra.launcher.n_jobs for each in (*made_of, sweeper.config)] == [expected, n_jobs, n_jobs]
+    assert sweeper._num_processes == expected
 
 
 @pytest.mark.parametrize(
@@ -366,6 +367,17 @@ def test_seeds_together_are_a_group_for_each_process_of_two_seeds_or_more(num_pr
     assert [settings[1:] for settings in jobs] == [
         (f"seed={group[0]}", "together=true", f"+seeds=[{','.join(group)}]") for group in expected
     ]
+
+
+@pytest.mark.parametrize(("num_processes", "sizes"), [(1, [4, 4]), (3, [4, 4]), (4, [2, 2, 2, 2])])
+def test_groups_of_several_agents_share_the_processes(num_processes, sizes):
+    sweeper = plugin("hydra_plugins.ctgraph_rl_sweeper.CellSweeper")(None, None, False)
+    sweeper.config = OmegaConf.create({"together": True})
+    sweeper._num_processes = num_processes
+    agents = ("agent=ppo", "agent=a2c")
+    cells = {Path(agent, str(seed)): (agent, f"seed={seed}") for agent in agents for seed in range(4)}
+
+    assert [len(folders) for folders in sweeper._jobs(cells).values()] == sizes
 
 
 def test_a_launcher_that_is_not_installed_names_the_extra():
