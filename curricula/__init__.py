@@ -20,7 +20,8 @@ from ctgraph_rl.checks import nearest, takes_its_kinds
 if TYPE_CHECKING:
     from ctgraph_rl.tasks.curriculum import Curriculum
 
-_MODULES = ("adaptation", "gym", "lives", "masks", "memory", "paper", "profile", "sharing", "task_free")
+_MODULES = ("paper", "masks", "memory", "lives", "sharing", "task_free", "adaptation", "profile", "gym")
+"""Where curricula are looked for, until one has the name; gym imports Gymnasium."""
 
 _HOMES = {
     "from_axes": "configured",
@@ -35,7 +36,8 @@ __all__ = ["from_axes", "from_graph", "from_meta_json", "load", "names", "sequen
 def names() -> list[str]:
     """Names of all curricula, without those that need a missing package."""
     needs = import_module("curricula.gym").NEEDS
-    return sorted(name for name in _named() if name not in needs or find_spec(needs[name]) is not None)
+    found = {name for module in _MODULES for name in _named(module)}
+    return sorted(name for name in found if name not in needs or find_spec(needs[name]) is not None)
 
 
 def load(name: str, **arguments: Any) -> Curriculum:
@@ -79,7 +81,8 @@ def summary(name: str) -> str:
 
 
 def _function(name: str) -> Callable[..., Curriculum]:
-    if name not in _named():
+    found = _find(name)
+    if found is None:
         near = nearest(str(name), names())
         hint = "ctgraph-rl curricula lists all" if near is None else f"did you mean {near!r}?"
         one_task = f"CT-{str(name).upper().replace('_', '-').removeprefix('CT-')}"
@@ -88,22 +91,28 @@ def _function(name: str) -> Callable[..., Curriculum]:
         if f"from_{name}" in _HOMES:
             hint = f"it is made from settings: curricula.from_{name}(...)"
         raise ValueError(f"unknown curriculum {name!r}; {hint}")
-    return _named()[name]
+    return found
+
+
+def _find(name: str) -> Callable[..., Curriculum] | None:
+    return next((table[name] for table in map(_named, _MODULES) if name in table), None)
 
 
 @cache
-def _named() -> dict[str, Callable[..., Curriculum]]:
-    tables = (import_module(f"curricula.{module}").NAMED for module in _MODULES)
-    return {name: takes_its_kinds(function) for table in tables for name, function in table.items()}
+def _named(module: str) -> dict[str, Callable[..., Curriculum]]:
+    table = import_module(f"curricula.{module}").NAMED
+    return {name: takes_its_kinds(function) for name, function in table.items()}
 
 
 def __getattr__(name: str) -> Any:
     if name in _HOMES:
         return getattr(import_module(f"curricula.{_HOMES[name]}"), name)
     # a module that is being imported needs no other
-    if name.startswith("_") or find_spec(f"curricula.{name}") is not None or name not in _named():
+    is_module = name.startswith("_") or find_spec(f"curricula.{name}") is not None
+    found = None if is_module else _find(name)
+    if found is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return _named()[name]
+    return found
 
 
 def __dir__() -> list[str]:
