@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from typing_extensions import override
 
-from ctgraph_rl.batch.assignment import find_numbers, require_num_ids
+from ctgraph_rl.batch.assignment import require_num_ids
 from ctgraph_rl.batch.rows import Rows, seed_rule
 from ctgraph_rl.checks import NamedValues, Rule, as_int, as_tuple, is_int, require, takes_numbers
 from ctgraph_rl.core.dynamics import NO_LEAF, OUTCOME_RUNNING, Shown, choose
@@ -100,7 +100,7 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
 
     def set_task(self, task: Task) -> None:
         """Change to a task of the pool at the next reset, or the next episode of a life."""
-        (self._next_number,) = find_numbers(self.task_pool, [task])
+        (self._next_number,) = self.rows.find_numbers([task])
 
     @torch.inference_mode()
     @takes_numbers
@@ -222,7 +222,7 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         self.single_observation_space, self._ids = add_task_ids(images, self.task_pool, task_ids, num_task_ids)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._numbers = self._next_numbers = np.array(find_numbers(self.task_pool, tasks))
+        self._numbers = self._next_numbers = np.array(self.rows.find_numbers(tasks))
         self._seeds = np.zeros(num_envs, np.int64)
         self._is_seeded = False
         self._is_over = np.ones(num_envs, np.bool_)
@@ -231,7 +231,7 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
 
     def set_tasks(self, tasks: Iterable[Task]) -> None:
         """Give every row a task of the pool, from its next reset."""
-        numbers = np.array(find_numbers(self.task_pool, tasks))
+        numbers = np.array(self.rows.find_numbers(tasks))
         require((len(numbers) == self.num_envs, f"set_tasks needs {self.num_envs} tasks, got {len(numbers)}"))
         self._next_numbers = numbers
 

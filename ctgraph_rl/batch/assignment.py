@@ -9,10 +9,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import are_ints, is_int, plain, require, require_all
+from ctgraph_rl.checks import are_ints, is_int, plain, require
 from ctgraph_rl.core import philox
 from ctgraph_rl.core.goal import Goal
-from ctgraph_rl.tasks.life import DrawnTasks
 from ctgraph_rl.tasks.protocol import MOST_IDS
 from ctgraph_rl.tasks.switch import Switch
 from ctgraph_rl.tasks.task import Task
@@ -36,24 +35,6 @@ def require_num_ids(task_ids: Mapping[Any, int] | None, num_task_ids: int | None
 def one_hot_ids(ids: Tensor, length: int) -> Tensor:
     """Return ids, int64 [N], as one-hot uint8 [N, length]; zeros for -1."""
     return (ids.unsqueeze(-1) == torch.arange(length, device=ids.device)).to(torch.uint8)
-
-
-def find_numbers(pool: Sequence[Task], tasks: Iterable[Task]) -> list[int]:
-    """Return the numbers of tasks in a pool.
-
-    Raises:
-        ValueError: for a task that is not in it.
-    """
-    tasks = require_all(Task, "tasks", tasks)
-    if isinstance(pool, DrawnTasks):
-        drawn = {task: pool.index(task) for task in dict.fromkeys(tasks)}
-        return [drawn[task] for task in tasks]
-    objects = {id(task): task for task in tasks}  # few, and a task's hash takes longer than its identity
-    number = {task: i for i, task in enumerate(pool)}
-    unknown = [task for task in dict.fromkeys(objects.values()) if task not in number]
-    require((not unknown, f"tasks must be in task_pool, got {unknown[:3]}; name them at construction"))
-    numbers = {identity: number[task] for identity, task in objects.items()}
-    return [numbers[id(task)] for task in tasks]
 
 
 def find_leaves(tasks: Sequence[Task], goals: Iterable[Goal]) -> list[int]:

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, nn
 
-from ctgraph_rl.batch.assignment import Assignment, find_leaves, find_numbers
+from ctgraph_rl.batch.assignment import Assignment, find_leaves
 from ctgraph_rl.batch.native import Native, kernel_rule, knows, require_kernel
 from ctgraph_rl.batch.params import make_shared_bank, make_tables
 from ctgraph_rl.batch.tensor_engine import TensorEngine
@@ -87,6 +87,7 @@ class Rows(TakesNumbers, nn.Module):
         else:
             pool = tasks if task_pool is None else require_all(Task, "task_pool", task_pool)
             self.pool = self.examples = tuple(dict.fromkeys(pool))
+        self._number = {task: number for number, task in enumerate(self.examples)}
         self.num_rows = len(tasks)
         require(
             seed_rule(seed),
@@ -163,6 +164,22 @@ class Rows(TakesNumbers, nn.Module):
         """The task of each row."""
         return tuple(self.pool[number] for number in self.task.tolist())
 
+    def find_numbers(self, tasks: Iterable[Task]) -> list[int]:
+        """Return the numbers of tasks in the pool.
+
+        Raises:
+            ValueError: for a task that is not in it.
+        """
+        tasks = require_all(Task, "tasks", tasks)
+        if isinstance(self.pool, DrawnTasks):
+            drawn = {task: self.pool.index(task) for task in dict.fromkeys(tasks)}
+            return [drawn[task] for task in tasks]
+        objects = {id(task): task for task in tasks}  # few, and a task's hash takes longer than its identity
+        unknown = [task for task in dict.fromkeys(objects.values()) if task not in self._number]
+        require((not unknown, f"tasks must be in task_pool, got {unknown[:3]}; name them at construction"))
+        numbers = {identity: self._number[task] for identity, task in objects.items()}
+        return [numbers[id(task)] for task in tasks]
+
     def set_tasks(self, tasks: Iterable[Task], at_episode_end: bool = False) -> None:
         """Give every row a task, in place.
 
@@ -173,7 +190,7 @@ class Rows(TakesNumbers, nn.Module):
         Raises:
             ValueError: if there is not one task per row, or a task is not in the pool.
         """
-        numbers = torch.tensor(find_numbers(self.pool, tasks), device=self.device, dtype=torch.int64)
+        numbers = torch.tensor(self.find_numbers(tasks), device=self.device, dtype=torch.int64)
         n = self.num_rows
         require((len(numbers) == n, f"set_tasks needs one task per row, {n} in all, got {len(numbers)}"))
         whole_pool = torch.arange(len(self.pool), device=self.device)
@@ -190,7 +207,7 @@ class Rows(TakesNumbers, nn.Module):
         Raises:
             ValueError: for less than two tasks, one that is not in the pool, and what is no switch.
         """
-        choices = torch.tensor(find_numbers(self.pool, tasks), device=self.device, dtype=torch.int64)
+        choices = torch.tensor(self.find_numbers(tasks), device=self.device, dtype=torch.int64)
         enough = len(choices) > 1, "switch_tasks needs at least two tasks, got one; use set_tasks"
         require(enough, switch_rule(switch))
         self._choose(choices, torch.zeros_like(self.row), switch, at_episode_end)

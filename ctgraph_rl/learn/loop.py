@@ -201,6 +201,7 @@ class Lockstep:
                 self.meters.append(UnitMeter(curriculum, agent, log, log_units))
         self.env = self._make_env(device)
         self.can_resume = True
+        self._resumes = resumes(curriculum)
         self.events = getattr(group.agents[0], "events", ())
         self.evaluators = []
         for agent, seed, log in zip(group.agents, seeds, logs, strict=True):
@@ -283,7 +284,7 @@ class Lockstep:
             for batch, carried in batches:
                 self._carried = carried
                 self._learn(batch, segment)
-                self.can_resume = resumes(self.curriculum) or self.frames == segment.end
+                self.can_resume = self._resumes or self.frames == segment.end
                 if len(self.failed) == len(self.logs):
                     return
                 yield True

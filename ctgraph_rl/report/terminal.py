@@ -41,7 +41,7 @@ MOST_POINTS = 32
 
 FEWEST_POINTS = 5
 
-WIDEST = 10**6
+WIDEST, NARROWEST = 10**6, len(" - |")
 
 
 def print_summary(run_dir: Path | str, console: Console | None = None) -> None:
@@ -53,16 +53,18 @@ def print_summary(run_dir: Path | str, console: Console | None = None) -> None:
     require((history is not None, f"{run_dir} cannot be shown: {run.reason}"))
     assert history is not None
     name = Path(run_dir).name
-    matrix = Table(title=_text(f"{name}: mean return on each task after each block"))
-    for heading in ("block", "frames", *history.labels):
-        matrix.add_column(_text(heading), justify="right")
-    for block, (frames, values) in enumerate(zip(history.ends, history.performance, strict=False)):
-        matrix.add_row(str(block), f"{frames:,}", *map(_shown, values))
-    curves = Table("task", "mean return at every evaluation")
-    for label, line in sparklines(history.evaluations, bars).items():
-        curves.add_row(_text(label), _text(line))
-    tables = [matrix, curves]
-    if max(map(_width, tables)) > console.width:
+    tables = []
+    if len(history.labels) * NARROWEST <= console.width:
+        matrix = Table(title=_text(f"{name}: mean return on each task after each block"))
+        for heading in ("block", "frames", *history.labels):
+            matrix.add_column(_text(heading), justify="right")
+        for block, (frames, values) in enumerate(zip(history.ends, history.performance, strict=False)):
+            matrix.add_row(str(block), f"{frames:,}", *map(_shown, values))
+        curves = Table("task", "mean return at every evaluation")
+        for label, line in sparklines(history.evaluations, bars).items():
+            curves.add_row(_text(label), _text(line))
+        tables = [matrix, curves]
+    if not tables or max(map(_width, tables)) > console.width:
         of_tasks = _tasks(name, history, {})
         room = console.width - _width(of_tasks) - len("│  ")
         if room >= FEWEST_POINTS:

@@ -200,7 +200,7 @@ class Curriculum:
         within = range(every, self.num_frames + 1, every) if every else ()
         return tuple(filter(self.moment, sorted({0, *self.ends, *within})))
 
-    @property
+    @cached_property
     def task_ids(self) -> Mapping[TaskLike, int]:
         """The id of each of ``tasks``."""
         return dict(zip(self.tasks, self.protocol.ids(len(self.tasks)), strict=True))

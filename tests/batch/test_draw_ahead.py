@@ -13,7 +13,8 @@ from helpers.oracles import WAIT, act, confounding, is_uniform, one_hot, optimal
 from helpers.task_families import SWITCHED, VECTORS, calls, read, seen
 from torch import Tensor
 
-from ctgraph_rl import CTGraphEnv, Steps, rollout
+import curricula
+from ctgraph_rl import CTGraphEnv, Steps, Task, rollout
 from ctgraph_rl.batch.rows import Rows
 from ctgraph_rl.batch.tensor_engine import MAX_TICKS, MAX_WORDS
 from ctgraph_rl.core import dynamics
@@ -280,3 +281,22 @@ def test_the_ids_of_decision_and_end_states_are_drawn_independently_without_uniq
     triples = ((shown[1] - 7) * 3 + shown[3] - 7) * 4 + shown[5] - 10
 
     assert is_uniform(triples.bincount(minlength=36).tolist())
+
+
+def test_a_change_of_tasks_reads_no_other_task_of_the_pool(monkeypatch):
+    curriculum = curricula.load("su_b1_4tasks")
+    task = curriculum.tasks[2]
+    rows = Rows([curriculum.tasks[0]] * 2, task_pool=curriculum.tasks)
+    read = []
+    original = Task.__hash__
+    monkeypatch.setattr(Task, "__hash__", lambda task: (read.append(task), original(task))[1])
+
+    rows.set_tasks([task] * 2)
+
+    assert {*map(id, read)} == {id(task)}
+
+
+def test_ids_of_tasks_are_found_once():
+    curriculum = curricula.load("su_b1_4tasks")
+
+    assert curriculum.task_ids is curriculum.task_ids

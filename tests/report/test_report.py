@@ -12,6 +12,7 @@ from rich.console import Console
 
 from ctgraph_rl import RunLog, metrics
 from ctgraph_rl.log.sums import write_metrics
+from ctgraph_rl.report import terminal
 from ctgraph_rl.report.terminal import print_summary, sparklines
 
 LABELS = ("goal1.1", "goal1.2")
@@ -52,6 +53,19 @@ def test_the_summary_shows_the_performance_matrix_and_every_metric(run_dir):
     assert ["forward transfer", "0.25", "1/(T-1) sum_{j=2..T} (R[j-1,j] - R[0,j])"] in rows
     assert ["backward transfer", "-0.25", "1/(T-1) sum_{j=1..T-1} (R[T,j] - R[j,j])"] in rows
     assert ["forgetting", "0.25", "1/(T-1) sum_{j=1..T-1} (max_{l=1..T-1} R[l,j] - R[T,j])"] in rows
+
+
+def test_no_table_is_laid_out_with_more_columns_than_fit(tmp_path, monkeypatch):
+    measured = []
+    width = terminal._width
+    monkeypatch.setattr(terminal, "_width", lambda table: (measured.append(len(table.columns)), width(table))[1])
+    labels = [f"goal{number}" for number in range(25)]
+    run_dir = write_run(tmp_path / "run", performance=[[0.0] * 25] * 26, labels=labels)
+
+    print_summary(run_dir, Console(file=io.StringIO(), width=80))
+    print_summary(run_dir, Console(file=io.StringIO(), width=100))
+
+    assert measured == [5, 27, 2, 5]
 
 
 def test_many_tasks_are_a_line_each(tmp_path):
