@@ -291,6 +291,16 @@ def test_windows_of_a_tuning_run_are_of_the_blocks_that_it_learned(run_of_twelve
     assert found.ends() == [0, 64, 128, 192]
 
 
+def test_a_windows_training_is_the_mean_over_episodes():
+    batches = [{"frames": 32, "episodes": 1, "return_mean": 0.0}, {"frames": 64, "episodes": 3, "return_mean": 1.0}]
+    log = RunLog()
+    log.measurements = [{"kind": "run", "life": 1}, *({"kind": "training", "block": 1, **each} for each in batches)]
+
+    [window] = by_windows(log).of_kind("training")
+
+    assert (window["frames"], window["episodes"], window["return_mean"]) == (64, 4, 0.75)
+
+
 def test_figures_of_a_life_have_the_lines_of_policies_that_do_not_learn(run_of_twelve):
     pytest.importorskip("matplotlib")
     from ctgraph_rl.report.figures.heatmaps import transfer_maps

@@ -28,6 +28,8 @@ def test_the_runs_are_of_the_named_stream_with_shorter_blocks_and_share_their_li
 
     assert {line["fingerprint"] for line in lines} <= {life.fingerprint, _with_ids(life).fingerprint}
     assert {line["num_tasks"] for line in lines} == {"100"}
+    for learner in streams.groups(lines, "agent", "method", "k").values():
+        assert [line["seed"] for line in learner] == ["0", "1", "2", "3", "4"]
 
 
 def _with_ids(life):
