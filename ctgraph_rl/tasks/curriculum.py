@@ -346,10 +346,7 @@ class Stream(Curriculum):
     @property
     def trained(self) -> Lazy:
         """For each block, the position of its task in ``tasks``."""
-        return Lazy(len(self.blocks), self._trained)
-
-    def _trained(self, place: int) -> tuple[int]:
-        return (self.blocks.origin(place),)
+        return Lazy(len(self.blocks), lambda place: (self.blocks.origin(place),))
 
     def for_seed(self, seed: int) -> Stream:
         """Return the stream that a run's seed draws; unchanged if it has its seed."""

@@ -56,8 +56,8 @@ def life_windows(section: Section) -> CaptionedFigure | None:
         axes.set(xlabel="tasks so far", ylabel=title)
     of_windows[1].set_ylim(-0.05, 1.05)
     for position, result in enumerate(shown):
-        rows = [[_value(run, f"retention_{lag}") for lag in LAGS] for run in result.finished]
-        _draw(last, LAGS, rows, agent_style(position, result.agent))
+        kept = [[run.metrics.get(f"retention_{lag}", {}).get("value") for lag in LAGS] for run in result.finished]
+        _draw(last, LAGS, np.array(kept, np.float64).tolist(), agent_style(position, result.agent))
     last.set(xlabel="blocks later", xscale="log", ylabel="retention")
     last.set_xticks(LAGS, [str(lag) for lag in LAGS])
     last.minorticks_off()
@@ -79,11 +79,6 @@ def _reached(stream: Any) -> dict[str, dict[str, float]]:
             lost = fmean(reached[name].in_frames for reached in of_tasks)
             found[name] = {"window_return": at_end, "frame_regret": lost / frames}
     return found
-
-
-def _value(run: Any, metric: str) -> float:
-    value = run.metrics.get(metric, {}).get("value")
-    return float("nan") if value is None else value
 
 
 def _draw(axes: Any, places: Any, rows: Sequence[Any], look: dict[str, Any]) -> None:
