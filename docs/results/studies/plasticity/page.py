@@ -85,7 +85,7 @@ def growth() -> Comparison:
             blocks = [int(line["block"]) for line in lines]
             of_seeds.append(10 * linear_regression(blocks, [float(line["area"]) for line in lines]).slope)
         slopes.append(of_seeds)
-    return statistics.compare(*slopes)
+    return statistics.compare(slopes[0], slopes[1])
 
 
 def nine_against(curriculum: str, other: str) -> dict[str, Comparison]:
