@@ -143,7 +143,7 @@ def by_windows(log: RunLog) -> RunLog:
     if 0 in ends:
         found.measurements.append({**ends[0], "label": labels[0]})
     for number, window in enumerate(windows, 1):
-        for part in torch.tensor(window, device="cpu").tensor_split(min(PARTS, len(window))):
+        for part in torch.tensor(window, dtype=torch.int64, device="cpu").tensor_split(min(PARTS, len(window))):
             own = [m for block in part.tolist() for m in training.get(block, ())]
             if own:
                 found.measurements.append({"kind": "training", "block": number, **_mean_line(own)})
