@@ -128,9 +128,7 @@ def fault(cfg: DictConfig, name: str, value: Any) -> str | None:
         with limited(SECONDS):
             build(changed)
     except ERRORS as error:
-        cause: BaseException = error
-        while cause.__cause__ is not None and not explain._says_what_to_do(cause):
-            cause = cause.__cause__
+        cause = explain.cause_of(error)
         said = isinstance(cause, (ValueError, ImportError)) and str(cause) and "\n" not in str(cause).strip()
         return None if said else f"{case}: {type(cause).__name__}: {cause}"
     except Exception as error:
