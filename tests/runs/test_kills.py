@@ -119,8 +119,9 @@ def here(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-def start_to_die(name: str, folder: str, write: int) -> None:
+def start_to_die(name: str, folder: str, write: int, num_threads: int) -> None:
     """Let a session learn into a folder, and die before a write."""
+    torch.set_num_threads(num_threads)  # a log says how many
     DEATH.folder = folder
     DEATH.left = write
     with pytest.MonkeyPatch.context() as patch:
@@ -129,7 +130,7 @@ def start_to_die(name: str, folder: str, write: int) -> None:
 
 def is_killed(name: str, folder: Path, write: int) -> bool:
     """Start in a separate process, which is killed before a write."""
-    process = FORKS.Process(target=start_to_die, args=(name, str(folder), write))
+    process = FORKS.Process(target=start_to_die, args=(name, str(folder), write, torch.get_num_threads()))
     process.start()
     process.join()
     assert process.exitcode in (0, -signal.SIGKILL)
