@@ -57,6 +57,7 @@ SHORT_NAMES = (
     "NDArray|Path|Sequence|Span|Tensor|TensorDictBase|nn.Module|nn.Linear|Rule|NamedValues|ReadOnlyValues|Items|Learnt"
     "|TensorsByName"
     r"|ctgraph_rl\.tasks\.life\.\w+"  # parts of a stream
+    r"|ctgraph_rl\.tasks\.observations\.Number"  # a type variable
 )
 SETTINGS = r"baselines\.\w+\.\w+Settings"  # the cards of agents list them
 nitpick_ignore_regex = [("py:.*", rf"({OTHERS})(\..*)?"), ("py:class", rf"{SHORT_NAMES}|{SETTINGS}")]

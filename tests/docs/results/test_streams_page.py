@@ -57,10 +57,20 @@ def test_settings_are_those_that_a_part_of_the_life_chooses(streams):
         assert {line["learning_rate"] for line in of_learner} == {streams.chosen(agent, "finetune", "first_tenth")}
     assert {line["learning_rate"] for line in lines if line["k"] == "100"} == {own("ppo", "finetune", "whole_life")}
     assert streams.chosen("ppo", "ewc", "whole_life") == own("ppo", "ewc") == own("ppo", "ewc", "whole_life") == "0.01"
-    assert [own(agent, "finetune") for agent in streams.AGENTS] == ["0.01", "0.01", "0.001"]
-    assert [own("ppo", "mask_ri"), own("ppo", "scratch"), own("dqn", "scratch")] == ["0.003", "0.003", "0.001"]
+    others = {
+        name
+        for name in streams.runs()
+        if name[1] != "frozen" and own(*name) != streams.chosen(name[0], "finetune", "first_tenth")
+    }
+    assert others == {
+        *(("lstm_ppo", "finetune"), ("lstm_ppo", "ewc"), ("ppo", "mask_ri"), ("ppo", "scratch")),
+        *(("dqn", "ewc"), ("dqn", "mask_ri")),
+    }
+    assert {own(*name) for name in others if name[0] != "lstm_ppo"} == {"0.003"}
+    assert own("lstm_ppo", "finetune") == own("lstm_ppo", "ewc") == "0.01"
     trials = streams.groups(streams.read(streams.TRIALS), "agent", "method", "learning_rate")
     assert {tuple(line["seed"] for line in lines) for lines in trials.values()} == {every}
+    assert len(trials) == 36
 
 
 def test_what_the_page_says_in_bold_is_what_was_found(streams):
