@@ -25,7 +25,7 @@ def adapt(policy: Any, greedy: bool, num_actions: int | None, shows_ids: bool = 
     """
     if isinstance(policy, TensorDictModuleBase | type):
         return policy
-    act = partial(_of_arrays, discrete=num_actions is not None)
+    act = partial(_act_on_arrays, discrete=num_actions is not None)
     if hasattr(policy, "predict"):
         predict = policy.predict
         space = getattr(policy, "observation_space", None)
@@ -51,7 +51,7 @@ def _parts(shown: Any) -> tuple[Any, Any]:
     return (shown["observation"], shown["task_id"]) if isinstance(shown, dict) else (shown, None)
 
 
-def _of_arrays(act: Callable[[Any, Any, Any], tuple[Any, Any]], discrete: bool) -> Policy:
+def _act_on_arrays(act: Callable[[Any, Any, Any], tuple[Any, Any]], discrete: bool) -> Policy:
     state = None
 
     def policy(data: TensorDictBase) -> TensorDictBase:

@@ -291,10 +291,15 @@ class _Collective:
                 frames = self.learners[given.receiver].steps.frames
                 member = self.members[given.receiver]
                 block = member.curriculum.block_at(frames)
-                values = {"sender": given.sender, **given.values}
-                member.log.append("help", block=block, frames=frames, **values)
+                member.log.append("help", block=block, frames=frames, sender=given.sender, **given.values)
                 self.log.append(
-                    "help", round=self.rounds, block=block, frames=frames, receiver=given.receiver, **values
+                    "help",
+                    round=self.rounds,
+                    block=block,
+                    frames=frames,
+                    receiver=given.receiver,
+                    sender=given.sender,
+                    **given.values,
                 )
         for kind in sorted({of for of, _ in self.mail.counts}):
             counts = {what: self.mail.counts[kind, what] for what in (SENT, DELIVERED, DROPPED, DELAYED)}

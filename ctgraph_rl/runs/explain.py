@@ -49,7 +49,7 @@ LAUNCHERS = {"hydra/launcher/joblib": "joblib", "hydra/launcher/submitit_slurm":
 _NO_SETTINGS = {"_target_", "hydra"}
 
 
-def cause_of(error: BaseException) -> BaseException:
+def find_cause(error: BaseException) -> BaseException:
     """Return the first error within Hydra's that says what to do, or the innermost."""
     told = (ValueError, OSError, ModuleNotFoundError)  # which say what to do, unless they are of OmegaConf
     while error.__cause__ is not None and (isinstance(error, OmegaConfBaseException) or not isinstance(error, told)):
@@ -59,7 +59,7 @@ def cause_of(error: BaseException) -> BaseException:
 
 def explain(error: BaseException, cfg: DictConfig | None = None) -> str:
     """Return one message for a user's error: its cause within Hydra's errors, and the likely name."""
-    cause = cause_of(error)
+    cause = find_cause(error)
     if isinstance(cause, OmegaConfBaseException):
         return _of_omegaconf(_first(cause), str(error).strip())
     if cfg is not None and isinstance(cause, ValueError):

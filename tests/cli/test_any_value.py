@@ -128,7 +128,7 @@ def fault(cfg: DictConfig, name: str, value: Any) -> str | None:
         with limited(SECONDS):
             build(changed)
     except ERRORS as error:
-        cause = explain.cause_of(error)
+        cause = explain.find_cause(error)
         said = isinstance(cause, (ValueError, ImportError)) and str(cause) and "\n" not in str(cause).strip()
         return None if said else f"{case}: {type(cause).__name__}: {cause}"
     except Exception as error:
