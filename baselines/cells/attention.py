@@ -43,6 +43,7 @@ class Attention(Cell):
 
     state_keys = ("recurrent_state_frames",)
     merges_rows = True
+    gains_together = False
     holds = "each of the last steps, by what was seen there"
 
     def __init__(

@@ -58,6 +58,9 @@ class Cell(TakesNumbers, nn.Module):
     merges_rows: ClassVar[bool] = False
     """Whether a step takes longer than finding the rows with the same history, so that it pays to act once for them."""
 
+    gains_together: ClassVar[bool] = True
+    """Whether several seeds in one process take less CPU time than each by itself."""
+
     holds: ClassVar[str]
     """What it can hold, in a few words."""
 

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch._inductor import compile
 from torch.fx import GraphModule
 
+from baselines.cells.cell import Cell
 from baselines.methods.method import AgentWithMethod
 from baselines.parts.hooks import Hooks
 from baselines.parts.learner import Learner
@@ -43,6 +44,9 @@ def why_not_together(agent: Agent) -> str | None:
         return f"{name} cannot be vectorised over seeds"
     if not has_stackable(learner, ("learn", "gradient_step")):
         return f"{name} does not learn by the steps that a batch of seeds shares"
+    for part in learner.modules():
+        if isinstance(part, Cell) and not part.gains_together:
+            return f"{type(part).__name__} takes no less time on a CPU with several seeds in one process"
     return why_not_step(learner)
 
 

@@ -444,8 +444,8 @@ class Doubled(L2):
 
 
 def test_what_cannot_be_one_batch_says_why(compose):
-    def reason(agent: str, method: str = "finetune") -> str | None:
-        cfg = compose(f"agent={agent}", f"method={method}", *TINY)
+    def reason(agent: str, method: str = "finetune", *more: str) -> str | None:
+        cfg = compose(f"agent={agent}", f"method={method}", *TINY, *more)
         make_agent = with_method(target(cfg, "agent"), target(cfg, "method"), CURRICULUM)
         return together.why_not_together(new_agent(CURRICULUM, make_agent, 0))
 
@@ -456,6 +456,9 @@ def test_what_cannot_be_one_batch_says_why(compose):
         == "Doubled cannot be vectorised over seeds: its hooks take the weights of one seed"
     )
     assert str(reason("ppo", "mask_amsc")).startswith("MaskAMSC cannot be vectorised over seeds: ")
+    for cell in ("attention", "backpropamine"):
+        assert "no less time on a CPU" in str(reason("lstm_ppo", "finetune", f"cell={cell}"))
+    assert reason("lstm_ppo") is reason("lstm_ppo", "finetune", "cell=gru") is None
     assert reason("lstm_ppo") is reason("dqn") is reason("ppo", "mask_lc") is reason("ppo", "packnet") is None
     switching = of(Block((ONE, TWO), 96, ByEpisode(2, together=True)), boundaries="hidden")
     assert why_not_together(switching) == "its blocks change the tasks of all rows at once"
