@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from statistics import fmean
 
@@ -25,9 +25,6 @@ K = {"first_tenth": "", "whole_life": ", k = 100"}
 NUM_WINDOWS = 10
 SHARES = (0.0, 1.0)
 
-TUNED_BY = ("100", "101")
-"""Seeds whose trials chose the rates of all lives."""
-
 EWC_OF_ALL = "EWC: more than fine-tuned, k = 100"
 
 LESS = 0.1
@@ -39,10 +36,9 @@ def runs() -> dict[tuple[str, ...], Raw]:
     return groups([line for line in read(NAME) if line["k"] == "10"], "agent", "method")
 
 
-def chosen(agent: str, method: str, part: str, seeds: Sequence[str] = TUNED_BY) -> str:
+def chosen(agent: str, method: str, part: str) -> str:
     """Return the learning rate with the largest mean return in ``first_tenth`` or ``whole_life``."""
-    own = [line for line in select(read(TRIALS), agent=agent, method=method) if line["seed"] in seeds]
-    by_rate = groups(own, "learning_rate")
+    by_rate = groups(select(read(TRIALS), agent=agent, method=method), "learning_rate")
     [rate] = max(by_rate, key=lambda rate: _mean(by_rate[rate], part))
     return rate
 
@@ -176,7 +172,6 @@ def page() -> str:
     """Return the page."""
     lines = read(NAME)
     effects = claims()
-    rates = {AGENTS[line["agent"]]: line["learning_rate"] for line in lines if line["k"] == "10"}
     texts = {
         "table": table_of_runs(),
         "trials": table_of_trials(),
@@ -186,7 +181,6 @@ def page() -> str:
         "claims": table_of_claims(effects),
         "lead_10": shown(effects["EWC: more than fine-tuned", "ppo"].estimate),
         "lead_100": shown(effects[EWC_OF_ALL, "ppo"].estimate),
-        "rates": ", ".join(f"{name} {rate}" for name, rate in rates.items()),
         "frames": f"{int(lines[0]['num_frames']):,}",
         "machines": machines(NAME),
     }
