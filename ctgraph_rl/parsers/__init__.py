@@ -51,8 +51,8 @@ TABLE_FORMATS = ("text", "markdown", "latex")
 def board() -> ArgumentParser:
     """Write a page with tables of submissions, and the same tables for programs.
 
-    board.html needs nothing else and no network; board.json, entries.csv and scores.csv have its numbers. The exit code
-    is 1 if something was left out.
+    board.html needs nothing else and no network; entries.csv and scores.csv have its numbers. The exit code is 1 if
+    something was left out.
     """
     parser = _parser(board)
     _add(parser, "submissions", "submissions, or folders that hold them", nargs="+", metavar="DIR")

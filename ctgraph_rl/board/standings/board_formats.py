@@ -1,22 +1,15 @@
-"""What tables of the board show, as cells, CSV and JSON."""
+"""What tables of the board show, as cells and CSV."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from ctgraph_rl import __version__
 from ctgraph_rl.board.standings.board_tables import BoardTable, Standing, is_significant
 from ctgraph_rl.board.standings.track_ceilings import in_words
 from ctgraph_rl.board.verification import STATES
-from ctgraph_rl.checks import NamedValues
 from ctgraph_rl.log.escape import csv_text
-from ctgraph_rl.metrics import METRICS
 from ctgraph_rl.report.formats import MEANS, measure_name
-from ctgraph_rl.report.statistics import Estimate
-
-SCHEMA = 1
 
 LEGEND = (
     f"{MEANS}; rank: those that comparisons of all pairs leave open, seed by seed, with Holm's correction at 5 %; "
@@ -138,55 +131,3 @@ def scores_csv(tables: Sequence[BoardTable]) -> str:
                 for seed, value in zip(table.track.seeds, values, strict=True):
                     rows.append((entry.id, seed, metric, value))
     return csv_text(rows)
-
-
-def as_json(tables: Sequence[BoardTable]) -> str:
-    """Return all tables as JSON."""
-    content = {"schema": SCHEMA, "made_by": f"ctgraph_rl {__version__}", "tables": list(map(_values, tables))}
-    return json.dumps(content, indent=1, allow_nan=False) + "\n"
-
-
-def _values(table: BoardTable) -> NamedValues:
-    track = table.track
-    variant = table.variant
-    entries = []
-    for line in table.standings:
-        entry = line.entry
-        values = {
-            "name": line.name,
-            "digest": entry.digest,
-            "method": entry.method,
-            "level": entry.level,
-            "bits": entry.verification.bits,
-            "best_rank": line.best_rank,
-            "worst_rank": line.worst_rank,
-            "why_not_ranked": entry.why_not_ranked,
-            "measures": {name: _numbers(estimate) for name, estimate in line.estimates.items()},
-            "values": entry.values,
-            "agent_bytes": entry.agent_bytes,
-            "failed": entry.method["failed"],
-        }
-        entries.append(values)
-    comparisons = []
-    for (one, other), found in table.pairs.items():
-        difference = _numbers(found.difference)
-        pair = {"first": one, "second": other, "difference": difference, "p_value": found.p_value, "holm": found.holm}
-        comparisons.append(pair)
-    return {
-        "track": {"name": track.name, "version": track.version, "measures": track.measures},
-        "breakthrough": track.breakthrough,
-        "rung": variant.rung,
-        "given": variant.given,
-        "curriculum": {"name": variant.curriculum.name, "fingerprint": variant.curriculum.fingerprint},
-        "steps": variant.curriculum.num_frames,
-        "seeds": track.seeds,
-        "score": {"name": track.score, "definition": METRICS[track.score].meaning.id},
-        "ceilings": table.ceilings._asdict(),
-        "entries": entries,
-        "comparisons": comparisons,
-    }
-
-
-def _numbers(estimate: Estimate) -> NamedValues:
-    names = ("value", "low", "high", "n", "n_undefined", "method")
-    return {name: getattr(estimate, name) for name in names}

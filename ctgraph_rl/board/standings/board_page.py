@@ -56,7 +56,6 @@ def write_board(
     folder = make_folder(Path(folder))
     files = {
         PAGE: html(made, problems),
-        "board.json": formats.as_json(made),
         "entries.csv": formats.entries_csv(made),
         "scores.csv": formats.scores_csv(made),
     }
