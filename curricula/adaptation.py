@@ -133,7 +133,7 @@ def nm_uniform_goals(num_frames: int | None = None, depth: int = 2, kind: str = 
     Args:
         num_frames: frames of all rows together; None: the bound.
         depth: 2, 3 or 4; 1, which is not published, has the numbers of 2.
-        kind: what states show, as in ``axes.observability``; all but ``full`` are not published.
+        kind: what states show, as in ``axes.reshaped``; all but ``full`` are not published.
     """
     require((depth in META_BATCHES, f"depth must be in 1..4, got {depth!r}"))
     batches, tasks_a_batch, episodes, test_episodes = META_BATCHES[depth]

@@ -1,8 +1,8 @@
 """The axes along which tasks differ, and the ways to put tasks in order.
 
 An axis takes a task, or several, and returns the variations of each, those of the first task first. So axes combine:
-``all_goals(image_seeds(task, (1, 2)))`` is every goal with the images of seed 1, then with those of seed 2. `product`
-writes the same as a list. `sequence` makes a `Curriculum`.
+``all_goals(image_seeds(task, (1, 2)))`` is every goal with the images of seed 1, then with those of seed 2. `sequence`
+makes a `Curriculum`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from typing import Any
 from ctgraph_rl.checks import NamedValues, as_tuple, is_int, require, require_all, takes_numbers
 from ctgraph_rl.core.goal import Goal
 from ctgraph_rl.core.graph import CTGraph, StateType
-from ctgraph_rl.tasks.configurations import OBSERVABILITY as OBSERVABILITY
 from ctgraph_rl.tasks.configurations import observations_of
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import ImageSet, PaperImages
@@ -30,7 +29,6 @@ MOVABLE = ("home", "fail", "wait", "decision", "end")
 
 Tasks = tuple[Task, ...]
 OneOrMore = Task | Iterable[Task]
-Axis = Callable[[Tasks], Tasks]
 
 MOST_TIMES = 100_000
 
@@ -124,77 +122,36 @@ def image_seeds(tasks: OneOrMore, seeds: Iterable[int]) -> Tasks:
     return each(tasks, vary)
 
 
-def image_sets(tasks: OneOrMore, sets: Iterable[ImageSet]) -> Tasks:
-    """Each task with other image sets of one shape, such as ``ImageFile.of("digits.npy")``."""
-    listed = tuple(sets)
-    return each(tasks, lambda task: [replace(task, images=images) for images in listed])
-
-
-@takes_numbers
-def shifted_ids(tasks: OneOrMore, shifts: Iterable[int], kinds: Sequence[str] = ("wait", "decision", "end")) -> Tasks:
-    """Each task with the images of some kinds of states moved to higher ids of the same image set.
-
-    Generated sets grow to the longest that is needed, so that unmoved images look the same in all tasks.
-
-    Args:
-        shifts: how far ids move; 0 is the task itself.
-        kinds: some of home, fail, wait, decision and end.
-    """
-    listed = require_all(int, "shifts", shifts)
-    moved = require_all(str, "kinds", kinds)
-    unknown = [kind for kind in moved if kind not in MOVABLE]
-    require((not unknown, f"kinds must be some of {', '.join(MOVABLE)}, got {', '.join(unknown)}"))
-
-    def vary(task: Task) -> list[Task]:
-        shown = []
-        for shift in listed:
-            ids: NamedValues = {}
-            for kind in moved:
-                first, last = task.observations.ids(StateType[kind.upper()])
-                ids[f"{kind}_ids"] = first + shift, last + shift
-            shown.append(replace(task.observations, **ids))
-        images = _with_room(task.images, max(observations.last_id for observations in shown) + 1)
-        return [replace(task, observations=observations, images=images) for observations in shown]
-
-    return each(tasks, vary)
-
-
 @takes_numbers
 def new_images(tasks: OneOrMore, num_sets: int, kinds: Sequence[str] = ("decision",)) -> Tasks:
     """Each task, and again with new images for some kinds of states: the paper's variant and invariant features.
 
+    Generated sets grow to the longest that is needed, so that the other images look the same in all tasks.
+
     Args:
         num_sets: sets of images, the task's own included.
-        kinds: the states whose images change.
+        kinds: the states whose images change, some of home, fail, wait, decision and end.
     """
-    require((is_int(num_sets, 1, MOST_TASKS), f"num_sets must be an integer >= 1, got {num_sets!r}"))
-
-    def vary(task: Task) -> Tasks:
-        ranges = [task.observations.ids(StateType[kind.upper()]) for kind in kinds if kind in MOVABLE]
-        first = min((first for first, _ in ranges), default=0)
-        last = max((last for _, last in ranges), default=0)
-        size = last - first + 1
-        beyond = task.observations.last_id + 1 - first
-        shifts = [0]
-        for number in range(num_sets - 1):
-            shifts.append(beyond + number * size)
-        return shifted_ids(task, shifts, kinds)
-
-    return each(tasks, vary)
-
-
-@takes_numbers
-def read_variation(tasks: OneOrMore, read_noise: int, read_rotation: int = 0) -> Tasks:
-    """Each task with images that vary on every read.
-
-    Args:
-        read_noise: largest addition to each pixel, in 0..255.
-        read_rotation: largest rotation in whole degrees, in 0..359.
-    """
+    moved = require_all(str, "kinds", kinds)
+    unknown = [kind for kind in moved if kind not in MOVABLE]
+    require(
+        (not unknown, f"kinds must be some of {', '.join(MOVABLE)}, got {', '.join(unknown)}"),
+        (is_int(num_sets, 1, MOST_TASKS), f"num_sets must be an integer >= 1, got {num_sets!r}"),
+    )
 
     def vary(task: Task) -> list[Task]:
-        varied = replace(task.observations, read_noise=read_noise, read_rotation=read_rotation)
-        return [replace(task, observations=varied)]
+        x = task.observations
+        ranges = {f"{kind}_ids": x.ids(StateType[kind.upper()]) for kind in moved}
+        first = min(low for low, _ in ranges.values())
+        size = max(high for _, high in ranges.values()) + 1 - first
+        shift = x.last_id + 1 - first
+        shown = [x]
+        for _ in range(num_sets - 1):
+            ids: NamedValues = {name: (low + shift, high + shift) for name, (low, high) in ranges.items()}
+            shown.append(replace(x, **ids))
+            shift += size
+        images = _with_room(task.images, max(observations.last_id for observations in shown) + 1)
+        return [replace(task, observations=observations, images=images) for observations in shown]
 
     return each(tasks, vary)
 
@@ -203,14 +160,14 @@ def read_variation(tasks: OneOrMore, read_noise: int, read_rotation: int = 0) ->
 
 
 @takes_numbers
-def growing_depth(tasks: OneOrMore, depths: Iterable[int], nested: bool = True) -> Tasks:
+def growing_depth(tasks: OneOrMore, depths: Iterable[int]) -> Tasks:
     """The graph of each task cut to other depths, all with the id ranges of the deepest: no image changes role.
+
+    A goal is the first decisions of the task's goal, on the path of every deeper one.
 
     Args:
         tasks: the deepest graph with its goal, or several.
         depths: each at most the graph's own.
-        nested: a goal is the first decisions of the task's goal, on the path of every deeper one. False: its last
-            decision is another one, so that no shallow goal is on a deeper path.
     """
     listed = require_all(int, "depths", depths)
 
@@ -218,27 +175,7 @@ def growing_depth(tasks: OneOrMore, depths: Iterable[int], nested: bool = True) 
         deepest = task.graph.depth
         bad = [depth for depth in listed if not is_int(depth, 1, deepest)]
         require((not bad, f"depths must be in 1..{deepest}, the depth of the task, got {bad}; give a deeper task"))
-        made = []
-        for depth in listed:
-            goal = task.goal[:depth]
-            if not nested and depth < deepest:
-                goal = (*goal[:-1], goal[-1] % task.graph.branching_factor + 1)
-            made.append(replace(task, graph=replace(task.graph, depth=depth), goal=goal))
-        return made
-
-    return each(tasks, vary)
-
-
-@takes_numbers
-def branching_factors(tasks: OneOrMore, factors: Iterable[int]) -> Tasks:
-    """Each task with other branching factors, up to its own, whose id ranges serve all."""
-    listed = require_all(int, "factors", factors)
-
-    def vary(task: Task) -> list[Task]:
-        widest = task.graph.branching_factor
-        bad = [factor for factor in listed if not is_int(factor, 2, widest)]
-        require((not bad, f"factors must be in 2..{widest}, the task's own, got {bad}; give a wider task"))
-        return [replace(task, graph=replace(task.graph, branching_factor=factor)) for factor in listed]
+        return [replace(task, graph=replace(task.graph, depth=depth), goal=task.goal[:depth]) for depth in listed]
 
     return each(tasks, vary)
 
@@ -254,22 +191,15 @@ def wait_probs(tasks: OneOrMore, probs: Iterable[float]) -> Tasks:
 
 
 @takes_numbers
-def observability(tasks: OneOrMore, kinds: Iterable[str], num_wait_images: int = 100) -> Tasks:
-    """Each task as more or less of its state is seen.
+def reshaped(task: Task, graph: CTGraph, kind: str, goal: Goal, num_wait_images: int = 100) -> Task:
+    """A task on another graph, of which more or less of the state is seen.
 
     Args:
-        tasks: a task or several, with enough images or a generated set, which is made long enough.
-        kinds: some of ``full``, ``decisions``, ``surjective`` and ``confounding``, as in
+        task: with enough images or a generated set, which is made long enough.
+        kind: ``full``, ``decisions``, ``surjective`` or ``confounding``, as in
             `ctgraph_rl.tasks.configurations.observations_of`.
         num_wait_images: for ``confounding``.
     """
-    listed = require_all(str, "kinds", kinds)
-    return each(tasks, lambda task: [reshaped(task, task.graph, kind, task.goal, num_wait_images) for kind in listed])
-
-
-@takes_numbers
-def reshaped(task: Task, graph: CTGraph, kind: str, goal: Goal, num_wait_images: int = 100) -> Task:
-    """A task on another graph, observed by a kind of `observability`."""
     observations = observations_of(graph, kind, num_wait_images)
     images = _with_room(task.images, observations.last_id + 1, exact=True)
     return replace(task, graph=graph, goal=goal, observations=observations, images=images)  # type: ignore[arg-type]
@@ -295,7 +225,7 @@ def random_tasks(
         branching_factors: choices of b.
         depths: choices of d.
         wait_probs: choices of p.
-        kinds: choices of `observability`.
+        kinds: choices of what is seen, as in `reshaped`.
         image_seeds: choices of the image seed.
     """
     given: tuple[Sequence[Any], ...] = (branching_factors, depths, wait_probs, kinds, image_seeds)
@@ -334,14 +264,6 @@ def _with_room(images: ImageSet, num_images: int, exact: bool = False) -> ImageS
 # order
 
 
-def product(tasks: OneOrMore, *axes: Axis) -> Tasks:
-    """Axes applied in turn: the last varies fastest."""
-    varied = as_tasks(tasks)
-    for axis in axes:
-        varied = axis(varied)
-    return varied
-
-
 def concatenate(*sequences: OneOrMore) -> Tasks:
     """One sequence after the other."""
     return tuple(itertools.chain.from_iterable(map(as_tasks, sequences)))
@@ -361,21 +283,10 @@ def interleave(*sequences: OneOrMore) -> Tasks:
 
 
 @takes_numbers
-def repeat(tasks: OneOrMore, times: int) -> Tasks:
-    """Each task several times in a row: A A B B."""
-    _check_times(times)
-    return each(tasks, lambda task: [task] * times)
-
-
-@takes_numbers
 def cycle(tasks: OneOrMore, times: int) -> Tasks:
     """The whole sequence several times: A B A B."""
-    _check_times(times)
-    return as_tasks(tasks) * times
-
-
-def _check_times(times: object) -> None:
     require((is_int(times, 1, MOST_TIMES), f"times must be an integer >= 1, got {times!r}"))
+    return as_tasks(tasks) * times
 
 
 @takes_numbers
@@ -387,25 +298,6 @@ def shuffle(tasks: OneOrMore, seed: int) -> Tasks:
 def reverse(tasks: OneOrMore) -> Tasks:
     """The last task first."""
     return as_tasks(tasks)[::-1]
-
-
-@takes_numbers
-def split(tasks: OneOrMore, num_held_out: int, seed: int) -> tuple[Tasks, Tasks]:
-    """Tasks to train and tasks to hold out, drawn without replacement, each in their order.
-
-    Args:
-        num_held_out: fewer than there are.
-        seed: an integer >= 0.
-    """
-    everything = as_tasks(tasks)
-    count = len(everything)
-    require(
-        (is_int(num_held_out, 1, count - 1), f"num_held_out must be in 1..{count - 1}, got {num_held_out!r}"),
-        (len(set(everything)) == count, "tasks to split must differ, else a task is both trained and held out"),
-    )
-    held_out = set(shuffled(range(count), seed)[:num_held_out])
-    rest = tuple(task for i, task in enumerate(everything) if i not in held_out)
-    return rest, tuple(everything[i] for i in sorted(held_out))
 
 
 @takes_numbers

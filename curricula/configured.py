@@ -176,7 +176,8 @@ def from_axes(
             by_seed.append(axes.growing_depth(axes.wait_probs(shown_task, probs), depths))
         tasks = _in_order(by_seed, goals, num_goals, order, seed=seed)
     if one_hot:
-        tasks = axes.image_sets(tasks, [OneHot(tasks[0].images.num_images)])
+        vectors = OneHot(tasks[0].images.num_images)
+        tasks = tuple(replace(each, images=vectors) for each in tasks)
     return _curriculum(
         name,
         tasks,

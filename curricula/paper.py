@@ -113,8 +113,10 @@ def instances(
         read_noise: largest addition to each pixel, in 0..255.
         read_rotation: largest rotation in whole degrees, in 0..359.
     """
-    varied = axes.read_variation(configured(configuration, image_seed), read_noise, read_rotation)
-    return _curriculum(f"{configuration}_instances", axes.all_goals(varied), num_frames)
+    task = configured(configuration, image_seed)
+    varied = replace(task.observations, read_noise=read_noise, read_rotation=read_rotation)
+    tasks = axes.all_goals(replace(task, observations=varied))
+    return _curriculum(f"{configuration}_instances", tasks, num_frames)
 
 
 def depth_growth(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
@@ -337,9 +339,9 @@ def co_hard_4tasks(num_frames: int = 1_024_000, image_seed: int = 1, num_wait_im
         image_seed: seed of the shared image set.
         num_wait_images: images that wait states draw from.
     """
-    task = replace(ct_su_b1(image_seed=image_seed), graph=CTGraph(2, 2, 0.9))
-    tasks = axes.all_goals(axes.observability(task, ["confounding"], num_wait_images))
-    return _curriculum("co_hard_4tasks", tasks, num_frames)
+    graph = CTGraph(2, 2, 0.9)
+    task = axes.reshaped(ct_su_b1(image_seed=image_seed), graph, "confounding", (1, 1), num_wait_images)
+    return _curriculum("co_hard_4tasks", axes.all_goals(task), num_frames)
 
 
 def _seeds(first: int) -> range:

@@ -4,38 +4,31 @@ from __future__ import annotations
 
 import random
 from dataclasses import replace
-from itertools import product as pairs
 
 import pytest
 
 import curricula
-from ctgraph_rl import Block, CTGraph, Evaluation, OneHot, PaperImages, ReferenceImages
+from ctgraph_rl import Block, CTGraph, OneHot, PaperImages, ReferenceImages
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_fo_b2, ct_graph, ct_su_b1
 from ctgraph_rl.tasks.protocol import Protocol
 from ctgraph_rl.tasks.switch import Drift
 from curricula import axes
 from curricula.axes import (
     all_goals,
-    branching_factors,
     concatenate,
     cycle,
     given_goals,
     goals_sharing,
     growing_depth,
     image_seeds,
-    image_sets,
     interleave,
     new_images,
-    observability,
-    product,
     random_goals,
     random_tasks,
-    repeat,
+    reshaped,
     reverse,
     sequence,
-    shifted_ids,
     shuffle,
-    split,
     wait_probs,
 )
 
@@ -90,7 +83,7 @@ def test_no_axis_reads_or_moves_the_global_generator():
     expected = random.random()
     random.seed(5)
 
-    random_goals(FO2, 3, 0), shuffle((A, B), 0), random_tasks(3, 0), split((A, B), 1, 0)
+    random_goals(FO2, 3, 0), shuffle((A, B), 0), random_tasks(3, 0)
 
     assert random.random() == expected
 
@@ -105,34 +98,11 @@ def test_image_seeds_change_the_seed_of_any_generated_set():
         image_seeds(replace(SU, images=OneHot(5)), [1])
 
 
-def test_image_sets_replace_the_images_if_they_are_enough():
-    assert [task.images for task in image_sets(SU, [OneHot(5), OneHot(6)])] == [OneHot(5), OneHot(6)]
-    with pytest.raises(ValueError, match=r"num_images=15 is too few for id 15 in observations: needs at least 16"):
-        image_sets(FO, [PaperImages(15)])
-
-
-def test_shifted_ids_move_to_images_of_one_set_that_all_tasks_share():
-    still, moved = shifted_ids(FO, (0, 14))
-
-    assert (still.observations, still.goal) == (FO.observations, FO.goal)
-    x = moved.observations
-    assert (x.wait_ids, x.decision_ids, x.end_ids) == ((16, 22), (23, 25), (26, 29))
-    assert (x.home_ids, x.fail_ids) == ((0, 0), (1, 1))
-    assert still.images == moved.images == PaperImages(30)
-
-
 def test_an_image_set_of_fixed_length_is_not_grown():
     (grouped, *_) = curricula.load("stochastic_grouped").tasks
 
-    with pytest.raises(ValueError, match="num_images=50 is too few for id 50 in observations: needs at least 51"):
-        shifted_ids(grouped, [1], ["end"])
-
-
-def test_shifts_that_overlap_are_refused():
-    with pytest.raises(ValueError, match=r"end_ids=\(12, 15\) overlaps decision_ids=\(10, 12\)"):
-        shifted_ids(FO, [1], ["decision"])
-    with pytest.raises(ValueError, match="kinds must be some of home, fail, wait, decision, end, got goal"):
-        shifted_ids(FO, [1], ["goal"])
+    with pytest.raises(ValueError, match="num_images=50 is too few for id 59 in observations: needs at least 60"):
+        new_images(grouped, 2, ["end"])
 
 
 def test_new_decision_images_leave_wait_images_as_they_are():
@@ -168,34 +138,10 @@ def test_growing_depth_nests_goals_and_keeps_the_deepest_graph_s_ids():
     assert tasks[3] == deepest
 
 
-def test_goals_that_are_not_nested_lie_on_no_deeper_path():
-    tasks = growing_depth(ct_graph(3, 5, goal=(3, 1, 2, 3, 1)), range(1, 6), nested=False)
-
-    assert goals(tasks) == ["1", "32", "313", "3121", "31231"]
-    assert not any(deep.goal[: len(shallow.goal)] == shallow.goal for shallow, deep in _pairs_of(tasks))
-
-
-def _pairs_of(tasks):
-    return [(tasks[i], tasks[j]) for i, j in pairs(range(len(tasks)), repeat=2) if i < j]
-
-
 @pytest.mark.parametrize("depths", [[0], [5], [2.0]])
 def test_a_depth_beyond_the_task_is_refused(depths):
     with pytest.raises(ValueError, match=r"depths must be (in 1..4|a list with at least one int)"):
         growing_depth(ct_graph(2, 4), depths)
-
-
-def test_branching_factors_share_the_ids_of_the_widest_graph():
-    widest = ct_graph(4, 2, goal=(2, 1))
-
-    tasks = branching_factors(widest, (2, 3, 4))
-
-    assert [task.graph for task in tasks] == [CTGraph(2, 2), CTGraph(3, 2), CTGraph(4, 2)]
-    assert {(task.goal, task.observations) for task in tasks} == {((2, 1), widest.observations)}
-    with pytest.raises(ValueError, match=r"factors must be in 2..4, the task's own, got \[5\]; give a wider task"):
-        branching_factors(widest, [5])
-    with pytest.raises(ValueError, match=r"goal must be 2 decisions in 1..2, such as 1\.1, got \(4, 1\)"):
-        branching_factors(replace(widest, goal=(4, 1)), [2])
 
 
 def test_wait_probs_change_nothing_else():
@@ -204,14 +150,15 @@ def test_wait_probs_change_nothing_else():
         wait_probs(SU, [1])
 
 
-def test_observability_gives_the_paper_s_configurations():
-    assert observability(SU, ("full", "surjective", "confounding")) == (FO, SU, CO)
-    assert observability(CO, ["full"]) == (FO,)
-    assert observability(ct_graph(3, 3), ["surjective"]) == (ct_graph(3, 3, fully_observable=False),)
+def test_reshaped_tasks_are_the_paper_s_configurations():
+    for kind, expected in (("full", FO), ("surjective", SU), ("confounding", CO)):
+        assert reshaped(SU, SU.graph, kind, "1.1") == reshaped(CO, SU.graph, kind, "1.1") == expected
+    wide = ct_graph(3, 3)
+    assert reshaped(wide, wide.graph, "surjective", wide.goal) == ct_graph(3, 3, fully_observable=False)
 
 
 def test_unique_decisions_only_leaves_one_wait_image():
-    (task,) = observability(FO2, ["decisions"])
+    task = reshaped(FO2, FO2.graph, "decisions", FO2.goal)
 
     x = task.observations
     assert (x.wait_ids, x.decision_ids, x.end_ids) == ((2, 2), (3, 9), (10, 17))
@@ -220,16 +167,16 @@ def test_unique_decisions_only_leaves_one_wait_image():
 
 
 def test_confounding_draws_from_as_many_wait_images_as_asked():
-    (task,) = observability(SU, ["confounding"], num_wait_images=7)
+    task = reshaped(SU, SU.graph, "confounding", SU.goal, num_wait_images=7)
 
     assert (task.observations.wait_ids, task.images) == ((3, 9), PaperImages(11))
 
 
 def test_an_unknown_observability_is_refused_with_the_choices():
     with pytest.raises(ValueError, match="kinds must be some of full, decisions, surjective, confounding, got 'none'"):
-        observability(SU, ["none"])
+        reshaped(SU, SU.graph, "none", SU.goal)
     with pytest.raises(ValueError, match="num_wait_images must be an integer >= 1, got 0"):
-        observability(SU, ["confounding"], 0)
+        reshaped(SU, SU.graph, "confounding", SU.goal, 0)
 
 
 def test_random_tasks_differ_and_depend_on_the_seed_alone():
@@ -258,45 +205,10 @@ def test_random_tasks_exhaust_small_choices_and_no_more():
         random_tasks(1, 0, depths=())
 
 
-def test_a_split_is_of_all_tasks_and_disjoint_and_fits_an_evaluation():
-    everything = random_tasks(12, seed=0, branching_factors=[2], depths=[2, 3])
-
-    training, held_out = split(everything, 4, seed=1)
-
-    assert (len(training), len(held_out)) == (8, 4)
-    assert set(training) | set(held_out) == set(everything)
-    assert split(everything, 4, seed=1) == (training, held_out) != split(everything, 4, seed=2)
-    curriculum = sequence("mine", training, 512, evaluation=Evaluation(held_out=held_out))
-    assert curriculum.evaluation.held_out == held_out
-
-
-@pytest.mark.parametrize(
-    ("tasks", "count", "message"),
-    [((A, B), 2, r"num_held_out must be in 1..1, got 2"), ((A, B, A), 1, "tasks to split must differ")],
-)
-def test_a_split_that_is_none_is_refused(tasks, count, message):
-    with pytest.raises(ValueError, match=message):
-        split(tasks, count, 0)
-
-
-def test_a_product_is_axes_applied_to_what_axes_return():
-    both = product(FO, lambda tasks: image_seeds(tasks, (1, 2)), all_goals)
-
-    assert both == all_goals(image_seeds(FO, (1, 2)))
-    assert [(task.image_seed, task.goal) for task in both[:5]] == [
-        (1, (1, 1)),
-        (1, (1, 2)),
-        (1, (2, 1)),
-        (1, (2, 2)),
-        (2, (1, 1)),
-    ]
-
-
 def test_sequences_are_put_in_order():
     assert concatenate((A, B), C, [D]) == (A, B, C, D)
     assert interleave((A, B, C), D) == (A, D, B, C)
     assert interleave((A, B), (C, D)) == (A, C, B, D)
-    assert repeat((A, B), 2) == (A, A, B, B)
     assert cycle((A, B), 2) == (A, B, A, B)
     assert reverse((A, B, C)) == (C, B, A)
 
@@ -326,7 +238,6 @@ def test_a_shuffle_is_a_permutation_that_the_seed_decides():
         (lambda: random_goals(SU, 5, 0), r"num_goals must be in 1..4, as many as differ, got 5"),
         (lambda: random_goals(SU, 2, None), "seed must be an integer >= 0, got None"),
         (lambda: shuffle((A, B), -1), "seed must be an integer >= 0, got -1"),
-        (lambda: repeat((A, B), 0), "times must be an integer >= 1, got 0"),
         (lambda: cycle((A, B), 0), "times must be an integer >= 1, got 0"),
         (lambda: image_seeds(SU, []), "seeds must be a list with at least one int, got none"),
         (lambda: sequence("mine", (A, B), (1, 2, 3)), "num_frames must be one for each of 2 blocks, got 3"),
