@@ -120,7 +120,7 @@ class MaskAMSC(SelectedMasks):
 
     @override
     def choose(self) -> list[int]:
-        known = self.embeddings.of_slot
+        known = self.embeddings
         earlier = [slot for slot in range(self.num_combined) if slot in known]
         if self.slot not in known or not earlier:
             return []

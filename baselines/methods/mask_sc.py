@@ -67,7 +67,7 @@ class MaskSC(SelectedMasks):
     def choose(self) -> list[int]:
         earlier = list(range(self.num_combined))
         if self.selection == "similarity":
-            known = self.embeddings.of_slot
+            known = self.embeddings
             if self.slot not in known:
                 return []
             near = {}

@@ -1,10 +1,9 @@
-"""The base class of masks that combine selected earlier tasks, and the embeddings of tasks."""
+"""The base class of masks that combine selected earlier tasks."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -21,7 +20,7 @@ from baselines.parts.embedding import (
     unit_directions,
     with_last,
 )
-from ctgraph_rl.checks import NamedValues, TakesNumbers, at_least_one, one_of, require
+from ctgraph_rl.checks import NamedValues, at_least_one, one_of, require
 from ctgraph_rl.tasks.kinds.task_like import TaskLike, most_actions
 
 EMBEDDINGS = ("lwe", "swe")
@@ -34,23 +33,36 @@ def own_generator(stream: int = STREAM) -> torch.Generator:
     return torch.Generator(device="cpu").manual_seed((torch.initial_seed() ^ stream << 32) % 2**63)
 
 
-class TaskEmbeddings(TakesNumbers):
-    """A moving average of the embeddings of samples for each task, by slot.
+class SelectedMasks(MaskLC):
+    """`MaskLC` that combines the new scores with those of selected earlier tasks; the others have a share of 0.
 
-    After each batch ``num_samples`` of the task's last ``buffer_size`` transitions are drawn without replacement, and
-    embedded in a direction e; the task's embedding is z <- norm(z / 2 + e / 2), e at first.
+    s = sum_i a_i s_i + a_k s_k over the selected tasks i, where a is the softmax of their b and the new scores' b. A
+    task that is not selected keeps its b. A task starts with none selected.
+
+    Each task has an embedding z. After each batch ``num_samples`` of the task's last ``buffer_size`` transitions are
+    drawn without replacement, and embedded in a direction e: z <- norm(z / 2 + e / 2), e at first.
+
+    Beside what `MaskLC` stores: copies of the selected tasks' scores, 4 P bytes each; an embedding of each task, 4 M n
+    bytes (``lwe``, n = pixels + actions + 1) or 4 L Q (``swe``); the last transitions.
 
     Args:
+        every: batches between two selections.
         embedding: ``lwe``, linear Wasserstein, or ``swe``, sliced Wasserstein.
         num_samples: N.
         buffer_size: stored transitions; at least N.
         num_references: M, of ``lwe``.
         num_directions: L, of ``swe``.
-        num_quantiles: along each direction, of ``swe``.
+        num_quantiles: Q, along each direction, of ``swe``.
     """
+
+    stackable = False
+
+    compares = True
+    community: Tensor  # scores of the selected tasks, and of others with a share of 0, float32 [n, P]
 
     def __init__(
         self,
+        every: int,
         embedding: str,
         num_samples: int,
         buffer_size: int,
@@ -58,89 +70,28 @@ class TaskEmbeddings(TakesNumbers):
         num_directions: int,
         num_quantiles: int,
     ) -> None:
-        require(*one_of(EMBEDDINGS, embedding=embedding))
+        super().__init__()
         require(
-            *at_least_one(num_samples=num_samples, num_references=num_references, num_directions=num_directions),
-            *at_least_one(buffer_size=buffer_size, num_quantiles=num_quantiles),
+            *at_least_one(every=every, num_samples=num_samples, num_references=num_references),
+            *at_least_one(buffer_size=buffer_size, num_directions=num_directions, num_quantiles=num_quantiles),
+            *one_of(EMBEDDINGS, embedding=embedding),
         )
         message = f"buffer_size must be at least num_samples={num_samples}, or no task is embedded, got {buffer_size}"
         require((buffer_size >= num_samples, message))
+        self.every = every
         self.embedding = embedding
         self.num_samples = num_samples
         self.buffer_size = buffer_size
         self.num_references = num_references
         self.num_directions = num_directions
         self.num_quantiles = num_quantiles
-        self.of_slot: dict[int, Tensor] = {}
-        """Embeddings of norm 1, float32 [Z]."""
+        self.embeddings: dict[int, Tensor] = {}
+        """Of norm 1, by slot, float32 [Z]."""
 
         self.recent: dict[str, Tensor] = {}
         """The present task's last transitions, [n, ...] each."""
 
-    def num_values(self, width: int) -> int:
-        """Return the numbers of an embedding of points with so many."""
-        points = self.num_references * width
-        return points if self.embedding == "lwe" else self.num_directions * self.num_quantiles
-
-    def start_task(self) -> None:
-        """Empty the buffer."""
-        self.recent = {}
-
-    def see(self, batch: TensorDictBase) -> None:
-        """Keep the transitions of a batch, [num_envs, num_steps]."""
-        self.recent = with_last(self.recent, batch, self.buffer_size)
-
-    def update(self, slot: int, num_actions: int, generator: torch.Generator) -> None:
-        """Update the present task's embedding, if there are enough transitions."""
-        if len(self.recent["action"]) < self.num_samples:
-            return
-        points = sampled_points(self.recent, self.num_samples, num_actions, generator)
-        width = points.shape[1]
-        if self.embedding == "lwe":
-            found = linear_wasserstein(points, reference_points(self.num_references, width))
-        else:
-            found = sliced_wasserstein(points, unit_directions(self.num_directions, width), self.num_quantiles)
-        new = normalize(found, dim=0)
-        old = self.of_slot.get(slot, new)
-        self.of_slot[slot] = normalize((old + new) / 2, dim=0)
-
-    def state(self) -> NamedValues:
-        """Return embeddings and buffer."""
-        return {"of_slot": dict(self.of_slot), "recent": dict(self.recent)}
-
-    def load(self, state: NamedValues) -> None:
-        """Restore what `state` returned."""
-        self.of_slot = {slot: value.cpu() for slot, value in state["of_slot"].items()}
-        self.recent = {key: value.cpu() for key, value in state["recent"].items()}
-
-
-class SelectedMasks(MaskLC):
-    """`MaskLC` that combines the new scores with those of selected earlier tasks; the others have a share of 0.
-
-    s = sum_i a_i s_i + a_k s_k over the selected tasks i, where a is the softmax of their b and the new scores' b. A
-    task that is not selected keeps its b. A task starts with none selected.
-
-    Beside what `MaskLC` stores: copies of the selected tasks' scores, 4 P bytes each; an embedding of each task, 4 M n
-    bytes (``lwe``, n = pixels + actions + 1) or 4 L Q (``swe``); the last transitions.
-
-    Args:
-        every: batches between two selections.
-        embedding: arguments of `TaskEmbeddings`.
-    """
-
-    Settings = TaskEmbeddings
-    stackable = False
-
-    compares = True
-    community: Tensor  # scores of the selected tasks, and of others with a share of 0, float32 [n, P]
-
-    def __init__(self, every: int, **embedding: Any) -> None:
-        super().__init__()
-        require(*at_least_one(every=every))
-        self.every = every
-        self.embeddings = TaskEmbeddings(**embedding)
         self.selected: list[int] = []
-
         self.num_batches = 0
 
     @override
@@ -158,8 +109,11 @@ class SelectedMasks(MaskLC):
 
     @override
     def num_kept(self) -> int:
-        pixels = math.prod(self.curriculum.examples[0].observation_shape)
-        return super().num_kept() + self.compares * self.embeddings.num_values(pixels + self.num_actions + 1)
+        if not self.compares:
+            return super().num_kept()
+        width = math.prod(self.curriculum.examples[0].observation_shape) + self.num_actions + 1
+        size = self.num_references * width if self.embedding == "lwe" else self.num_directions * self.num_quantiles
+        return super().num_kept() + size
 
     def choose(self) -> list[int]:
         """Return the slots of the tasks to select, among the first `num_combined`."""
@@ -169,7 +123,7 @@ class SelectedMasks(MaskLC):
     def start_task(self, task: int | None) -> None:
         super().start_task(task)
         self.num_batches = 0
-        self.embeddings.start_task()
+        self.recent = {}
 
     @override
     def init_scores(self) -> None:
@@ -179,13 +133,21 @@ class SelectedMasks(MaskLC):
     @override
     def on_batch(self, batch: TensorDictBase) -> None:
         if self.compares:
-            self.embeddings.see(batch)
+            self.recent = with_last(self.recent, batch, self.buffer_size)
 
     @override
     @torch.no_grad()
     def after_learning(self) -> None:
-        if self.compares:
-            self.embeddings.update(self.slot, self.num_actions, self.generator)
+        if self.compares and len(self.recent["action"]) >= self.num_samples:
+            points = sampled_points(self.recent, self.num_samples, self.num_actions, self.generator)
+            width = points.shape[1]
+            if self.embedding == "lwe":
+                found = linear_wasserstein(points, reference_points(self.num_references, width))
+            else:
+                found = sliced_wasserstein(points, unit_directions(self.num_directions, width), self.num_quantiles)
+            new = normalize(found, dim=0)
+            old = self.embeddings.get(self.slot, new)
+            self.embeddings[self.slot] = normalize((old + new) / 2, dim=0)
         self.num_batches += 1
         if self.num_combined and self.num_batches % self.every == 0:
             self.select(self.choose())
@@ -217,12 +179,14 @@ class SelectedMasks(MaskLC):
     @override
     def get_extra_state(self) -> NamedValues:
         counts = {"selected": self.selected, "num_batches": self.num_batches, "random": self.generator.get_state()}
-        return {**super().get_extra_state(), **counts, "embeddings": self.embeddings.state()}
+        embeddings = {"of_slot": dict(self.embeddings), "recent": dict(self.recent)}
+        return {**super().get_extra_state(), **counts, "embeddings": embeddings}
 
     @override
     def set_extra_state(self, state: NamedValues) -> None:
         super().set_extra_state(state)
         self.num_batches = state["num_batches"]
         self.generator.set_state(state["random"].cpu())
-        self.embeddings.load(state["embeddings"])
+        self.embeddings = {slot: value.cpu() for slot, value in state["embeddings"]["of_slot"].items()}
+        self.recent = {key: value.cpu() for key, value in state["embeddings"]["recent"].items()}
         self._gather(list(state["selected"]))

@@ -51,7 +51,7 @@ def after(method: Any, *embeddings: torch.Tensor, number: int | None = None) -> 
         method.start_task(each)
         method.end_task()
     method.start_task(ids[-1])
-    method.embeddings.of_slot = dict(enumerate(embeddings))
+    method.embeddings = dict(enumerate(embeddings))
     if isinstance(method, MaskAMSC):
         method.competence = dict.fromkeys(range(len(ids)), 1.0)
     return method
@@ -140,7 +140,7 @@ def test_a_task_has_a_moving_average_of_the_embeddings_of_its_own_last_transitio
     for batch in (first, second):
         its.on_batch(batch)
         its.after_learning()
-        drawn.append({key: value.clone() for key, value in its.embeddings.recent.items()})
+        drawn.append({key: value.clone() for key, value in its.recent.items()})
 
     its.generator.set_state(state)
     expected = None
@@ -151,11 +151,11 @@ def test_a_task_has_a_moving_average_of_the_embeddings_of_its_own_last_transitio
         new = linear_wasserstein(points, reference_points(50, points.shape[1]))
         new = new / new.norm()
         expected = new if expected is None else (expected + new) / (expected + new).norm()
-    assert_close(its.embeddings.of_slot[0], expected)
+    assert_close(its.embeddings[0], expected)
     assert torch.equal(torch.get_rng_state(), stream)
     attached.start_task(1)
     its.on_batch(first[:, :1])
-    assert len(its.embeddings.recent["action"]) == 16
+    assert len(its.recent["action"]) == 16
 
 
 def test_a_task_with_fewer_transitions_than_a_sample_has_no_embedding_and_selects_nothing(compose):
@@ -164,7 +164,7 @@ def test_a_task_with_fewer_transitions_than_a_sample_has_no_embedding_and_select
     stay(attached, 0)
     stay(attached, 1)
 
-    assert attached.method.embeddings.of_slot == {} and attached.method.selected == []
+    assert attached.method.embeddings == {} and attached.method.selected == []
 
 
 @pytest.mark.slow
