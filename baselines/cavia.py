@@ -17,23 +17,13 @@ from torch import Tensor
 from torch.func import functional_call
 from typing_extensions import override
 
-from baselines.parts.gates import GatedNetwork
-from baselines.parts.inner_loop import InnerLoop, InnerLoopSettings, InnerModel, NamedWeights, NetInputs
+from baselines.parts.inner_loop import InnerLoop, InnerLoopSettings, InnerModel, NamedWeights
+from baselines.parts.networks import Data
 from ctgraph_rl.checks import is_int, require
 
 
 class Context(InnerModel):
-    """The context inputs of the network adapt.
-
-    Args:
-        net: reads the context as its last input.
-        inner_rate: step size of the adaptation.
-        num_context: context inputs.
-    """
-
-    def __init__(self, net: GatedNetwork, inner_rate: float, num_context: int) -> None:
-        super().__init__(net, inner_rate)
-        self.num_context = num_context
+    """The context inputs of the network adapt, its last ones."""
 
     @override
     def start(self, theta: NamedWeights) -> NamedWeights:
@@ -41,9 +31,9 @@ class Context(InnerModel):
         return {"context": like.new_zeros(self.num_context)}
 
     @override
-    def logits(self, theta: NamedWeights, own: NamedWeights, seen: NetInputs) -> Tensor:
-        context = own["context"].expand(*seen[0].shape[: -self.net.event_dims], -1)
-        return functional_call(self.net, theta, (*seen, context))
+    def logits(self, theta: NamedWeights, own: NamedWeights, steps: Data) -> Tensor:
+        context = own["context"].expand(*steps["observation"].shape[: -self.net.event_dims], -1)
+        return functional_call(self.net, theta, (*(steps[key] for key in self.keys), context))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,13 +51,10 @@ class CAVIA(InnerLoop):
     """A policy of which a context adapts."""
 
     Settings = CAVIASettings
+    Model = Context
     solves = "tasks whose goal is drawn from several: it adapts a context after some episodes"
 
     @property
     @override
     def num_context(self) -> int:
         return self.settings.num_context
-
-    @override
-    def make_model(self, net: GatedNetwork, inner_rate: float) -> InnerModel:
-        return Context(net, inner_rate, self.num_context)

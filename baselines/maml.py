@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.func import functional_call
 from typing_extensions import override
 
-from baselines.parts.gates import GatedNetwork
-from baselines.parts.inner_loop import InnerLoop, InnerModel, NamedWeights, NetInputs
+from baselines.parts.inner_loop import InnerLoop, InnerModel, NamedWeights
+from baselines.parts.networks import Data
 
 
 class AllWeights(InnerModel):
@@ -26,15 +26,12 @@ class AllWeights(InnerModel):
         return theta
 
     @override
-    def logits(self, theta: NamedWeights, own: NamedWeights, seen: NetInputs) -> Tensor:
-        return functional_call(self.net, own, seen)
+    def logits(self, theta: NamedWeights, own: NamedWeights, steps: Data) -> Tensor:
+        return functional_call(self.net, own, tuple(steps[key] for key in self.keys))
 
 
 class MAML(InnerLoop):
     """A policy of which all weights adapt."""
 
+    Model = AllWeights
     solves = "tasks whose goal is drawn from several: it adapts all weights after some episodes"
-
-    @override
-    def make_model(self, net: GatedNetwork, inner_rate: float) -> InnerModel:
-        return AllWeights(net, inner_rate)

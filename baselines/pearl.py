@@ -35,7 +35,7 @@ from torchrl.data import Composite, TensorSpec
 from typing_extensions import override
 
 from baselines.parts.gates import GATES, GatedNetwork, gated_network, require_gated_weights, shown_specs
-from baselines.parts.inner_loop import NetInputs, places
+from baselines.parts.inner_loop import places
 from baselines.parts.learner import MOST_PASSES, Learner
 from baselines.parts.networks import Data, Items, TensorsByName, draw, entropy, guided, is_greedy, num_actions_of
 from baselines.parts.q_learning import require_replay
@@ -53,6 +53,8 @@ from ctgraph_rl.checks import (
     require,
 )
 from ctgraph_rl.learn.collect import UNSTORED
+
+NetInputs = tuple[Tensor, ...]
 
 SMALLEST_VARIANCE = 1e-7
 

@@ -20,7 +20,7 @@ As weights change between batches, only trials that begin and end within one bat
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
@@ -54,7 +54,6 @@ from ctgraph_rl.learn.collect import UNSTORED
 
 OUTER = ("trpo", "ppo")
 
-ACTIONS = f"{UNSTORED}actions"
 REWARDS = f"{UNSTORED}rewards"
 EPISODES = f"{UNSTORED}episodes"
 """A row's steps since its trial began, [rows, steps]; episodes that are not needed have number 0."""
@@ -66,23 +65,12 @@ SMALLEST_STD = 1e-4
 """Added to the standard deviation of A, 0 where the baseline fits all returns."""
 
 NamedWeights = TensorsByName
-NetInputs = tuple[Tensor, ...]
-
-
-class Episodes(NamedTuple):
-    """What a loss reads of the steps of one or more trials."""
-
-    seen: tuple[Tensor, ...]
-    action: Tensor
-    advantage: Tensor
-    weight: Tensor
 
 
 class Played(NamedTuple):
     """Steps of trials, padded to one length."""
 
-    seen: tuple[Tensor, ...]  # what the network reads, [trials, steps, ...] each
-    action: Tensor  # int64 [trials, steps]
+    steps: Items  # what the network reads, and ``action``, [trials, steps, ...] each
     reward: Tensor  # [trials, steps]
     number: Tensor  # of the step's episode in its trial, from 1; 0 where padded, int64 [trials, steps]
 
@@ -107,7 +95,7 @@ class Played(NamedTuple):
         begins[:, 0] = True
         place, first = places(begins)
         time = (place - first).unsqueeze(-1).double() / 100
-        flat = net.flat(self.seen[0]).double()
+        flat = net.flat(self.steps["observation"]).double()
         return torch.cat([flat, flat**2, time, time**2, time**3, torch.ones_like(time)], dim=-1)
 
     def baseline(self, net: GatedNetwork, gamma: float) -> Tensor:
@@ -130,10 +118,13 @@ class Played(NamedTuple):
         std = variance.sqrt()
         return (centred / (std + SMALLEST_STD)).to(self.reward.dtype)
 
-    def episodes(self, net: GatedNetwork, gamma: float, before: Played) -> Episodes:
-        """Return what a loss reads, with a baseline fitted to the steps ``before`` the adaptation."""
+    def episodes(self, net: GatedNetwork, gamma: float, before: Played) -> Items:
+        """Return what a loss reads: the steps with ``advantage`` and ``weight``, [trials, steps] each.
+
+        The baseline is fitted to the steps ``before`` the adaptation.
+        """
         advantage = self.advantage(net, gamma, before.baseline(net, gamma))
-        return Episodes(self.seen, self.action, advantage, self.weight().to(advantage.dtype))
+        return {**self.steps, "advantage": advantage, "weight": self.weight().to(advantage.dtype)}
 
 
 def places(begins: Tensor) -> tuple[Tensor, Tensor]:
@@ -152,13 +143,17 @@ class InnerModel(nn.Module):
     """A network with weights theta that all trials share, and weights of each trial, which adapt.
 
     Args:
+        net: reads ``keys`` of the steps, and context inputs, if any.
         inner_rate: step size of the adaptation.
+        num_context: context inputs.
     """
 
-    def __init__(self, net: GatedNetwork, inner_rate: float) -> None:
+    def __init__(self, net: GatedNetwork, keys: Sequence[str], inner_rate: float, num_context: int) -> None:
         super().__init__()
         self.net = net
+        self.keys = keys
         self.inner_rate = inner_rate
+        self.num_context = num_context
 
     @property
     def theta(self) -> NamedWeights:
@@ -169,24 +164,24 @@ class InnerModel(nn.Module):
         """Return a trial's weights before its adaptation."""
         raise NotImplementedError
 
-    def logits(self, theta: NamedWeights, own: NamedWeights, seen: NetInputs) -> Tensor:
+    def logits(self, theta: NamedWeights, own: NamedWeights, steps: Data) -> Tensor:
         """Return logits of steps of one trial, [..., num_actions]."""
         raise NotImplementedError
 
-    def inner_loss(self, own: NamedWeights, theta: NamedWeights, before: Episodes) -> Tensor:
+    def inner_loss(self, own: NamedWeights, theta: NamedWeights, before: Data) -> Tensor:
         """Return L of one trial, a scalar."""
-        log_probs = log_prob(self.logits(theta, own, before.seen), before.action)
-        return -(before.weight * before.advantage * log_probs).sum()
+        log_probs = log_prob(self.logits(theta, own, before), before["action"])
+        return -(before["weight"] * before["advantage"] * log_probs).sum()
 
-    def adapt(self, theta: NamedWeights, own: NamedWeights, before: Episodes) -> NamedWeights:
+    def adapt(self, theta: NamedWeights, own: NamedWeights, before: Data) -> NamedWeights:
         """Return a trial's weights after a gradient step on L."""
         gradients = grad(self.inner_loss)(own, theta, before)
         return {name: value - self.inner_rate * gradients[name] for name, value in own.items()}
 
-    def adapted_logits(self, theta: NamedWeights, before: Episodes, seen: NetInputs) -> Tensor:
+    def adapted_logits(self, theta: NamedWeights, before: Data, after: Data) -> Tensor:
         """Return logits of one trial's steps after its adaptation, [steps, num_actions]."""
         own = self.adapt(theta, self.start(theta), before)
-        return self.logits(theta, own, seen)
+        return self.logits(theta, own, after)
 
 
 class InnerPolicy(TensorDictModuleBase):
@@ -196,16 +191,15 @@ class InnerPolicy(TensorDictModuleBase):
         adapt_episodes: episodes before and after the adaptation.
     """
 
-    def __init__(self, model: InnerModel, seen_keys: list[str], adapt_episodes: int, gamma: float) -> None:
+    def __init__(self, model: InnerModel, adapt_episodes: int, gamma: float) -> None:
         super().__init__()
         self.model = model
         self.adapt_episodes = adapt_episodes
         self.gamma = gamma
-        self.seen_keys = seen_keys
-        self.kept_keys = [f"{UNSTORED}{key}" for key in seen_keys]
+        self.kept_keys = {key: f"{UNSTORED}{key}" for key in ("action", *model.keys)}
         self.own_keys = {name: f"{UNSTORED}{name}" for name in model.start(model.theta)}
-        state = ["trial", ACTIONS, REWARDS, EPISODES, *self.kept_keys, *self.own_keys.values()]
-        self.in_keys = [*seen_keys, "is_init", "reward", *state]
+        state = ["trial", REWARDS, EPISODES, *self.kept_keys.values(), *self.own_keys.values()]
+        self.in_keys = [*model.keys, "is_init", "reward", *state]
         self.out_keys = ["action", *(("next", key) for key in state)]
 
     @override
@@ -220,7 +214,7 @@ class InnerPolicy(TensorDictModuleBase):
         rewards = torch.cat([tensordict[REWARDS], tensordict["reward"]], dim=1)
         rewards = rewards[:, rewards.shape[1] - num_kept :]
         own = self._own(theta, tensordict, rewards, fresh=fresh, adapts=adapts)
-        seen = tuple(tensordict[key] for key in self.seen_keys)
+        seen = {key: tensordict[key] for key in self.model.keys}
         logits = vmap(self.model.logits, in_dims=(None, 0, 0))(theta, own, seen)
         action = logits.argmax(dim=-1) if is_greedy() else draw(logits.softmax(dim=-1))
         tensordict.set("action", guided(tensordict, action))
@@ -234,16 +228,16 @@ class InnerPolicy(TensorDictModuleBase):
         first = int((needed.cumsum(dim=0) == 0).sum())
         tensordict.set(("next", EPISODES), numbers[:, first:])
         tensordict.set(("next", REWARDS), rewards[:, first:])
-        for kept, seen_key in zip((ACTIONS, *self.kept_keys), ("action", *self.seen_keys), strict=True):
-            steps = torch.cat([tensordict[kept], tensordict[seen_key].unsqueeze(1)], dim=1)
+        for key, kept in self.kept_keys.items():
+            steps = torch.cat([tensordict[kept], tensordict[key].unsqueeze(1)], dim=1)
             tensordict.set(("next", kept), steps[:, first:])
         return tensordict
 
     def _own(self, theta: NamedWeights, data: Data, rewards: Tensor, *, fresh: Tensor, adapts: Tensor) -> NamedWeights:
         own = {name: data[key] for name, key in self.own_keys.items()}
         if adapts.any():
-            seen = tuple(data[key][adapts] for key in self.kept_keys)
-            played = Played(seen, data[ACTIONS][adapts], rewards[adapts], data[EPISODES][adapts])
+            steps = {key: data[kept][adapts] for key, kept in self.kept_keys.items()}
+            played = Played(steps, rewards[adapts], data[EPISODES][adapts])
             theirs = {name: value[adapts] for name, value in own.items()}
             adapted = vmap(self.model.adapt, in_dims=(None, 0, 0))(theta, theirs, self.before(played))
             for name, value in adapted.items():
@@ -252,7 +246,7 @@ class InnerPolicy(TensorDictModuleBase):
             own[name] = torch.where(beside(fresh, own[name]), first, own[name])
         return own
 
-    def before(self, played: Played) -> Episodes:
+    def before(self, played: Played) -> Items:
         """Return what L reads of the steps before an adaptation."""
         return played.episodes(self.model.net, self.gamma, played)
 
@@ -302,6 +296,7 @@ class InnerLoop(Learner):
 
     Settings: ClassVar[Any] = InnerLoopSettings
     settings: Any
+    Model: ClassVar[type[InnerModel]]
     memory = True
     needs_whole_trials = True
     needs_episodes = True
@@ -328,21 +323,17 @@ class InnerLoop(Learner):
             gate=given.gate,
             gate_size=given.gate_size,
         )
-        model = self.make_model(net, given.inner_rate)
+        model = self.Model(net, list(self.specs), given.inner_rate, self.num_context)
         count = given.num_envs * sum(value.numel() for value in model.start(model.theta).values())
         adapted = f"weights of each of num_envs={given.num_envs} rows, their gradients and what they become"
         require_memory(adapted, 16 * count, "rows or smaller layers")
-        self.policy = InnerPolicy(model, list(self.specs), given.adapt_episodes, given.gamma)
+        self.policy = InnerPolicy(model, given.adapt_episodes, given.gamma)
         self.optimiser = make_optimiser("adam", net.parameters(), given.learning_rate)
 
     @property
     def num_context(self) -> int:
         """Inputs of the network beside observations."""
         return 0
-
-    def make_model(self, net: GatedNetwork, inner_rate: float) -> InnerModel:
-        """Return the model of a network."""
-        raise NotImplementedError
 
     @property
     def model(self) -> InnerModel:
@@ -356,7 +347,7 @@ class InnerLoop(Learner):
         state = {
             "trial": like.new_zeros(num_envs, 1, dtype=torch.int64),
             "reward": like.new_zeros(num_envs, 1),
-            ACTIONS: like.new_zeros(num_envs, 0, dtype=torch.int64),
+            f"{UNSTORED}action": like.new_zeros(num_envs, 0, dtype=torch.int64),
             EPISODES: like.new_zeros(num_envs, 0, dtype=torch.int64),
             REWARDS: like.new_zeros(num_envs, 0),
         }
@@ -377,8 +368,8 @@ class InnerLoop(Learner):
     def trials(self, batch: TensorDictBase) -> Items | None:
         """Return what the losses read of trials within a batch; None without one.
 
-        Keys are those of `Episodes`, the keys that were ``seen``, ``("before", key)`` for steps before the adaptation,
-        and ``log_prob`` of the present weights.
+        Keys are those of `Played.episodes`, ``("before", key)`` for steps before the adaptation, and ``log_prob`` of
+        the present weights.
         """
         number = batch["next", "trial"].squeeze(-1)
         begins = batch["is_init"].squeeze(-1) & (number == 1)
@@ -395,8 +386,9 @@ class InnerLoop(Learner):
         before = self._played(batch, rows, own & is_before)
         after = self._played(batch, rows, own & ~is_before)
         policy = self.policy
-        found = self._as_data(policy.before(before), "before")
-        found |= self._as_data(after.episodes(self.model.net, policy.gamma, before))
+        found = after.episodes(self.model.net, policy.gamma, before)
+        for key, value in policy.before(before).items():
+            found["before", key] = value
         found["log_prob"] = log_prob(self._adapted_logits(found), found["action"])
         for name, played in (("before", before), ("after", after)):
             total = (played.reward * (played.number > 0)).sum()
@@ -410,30 +402,21 @@ class InnerLoop(Learner):
         steps = (first + place).clamp(max=chosen.shape[1] - 1)
         at = (rows.unsqueeze(-1), steps)
         number = torch.where(place < count, batch["next", "trial"].squeeze(-1)[at], 0)
-        seen = tuple(batch[key][at] for key in self.specs)
-        return Played(seen, batch["action"][at], batch["next", "reward"].squeeze(-1)[at], number)
-
-    def _as_data(self, episodes: Episodes, *labels: str) -> Items:
-        keys = (*self.specs, *Episodes._fields[1:])
-        values = (*episodes.seen, *episodes[1:])
-        return {(*labels, key) if labels else key: value for key, value in zip(keys, values, strict=True)}
+        steps = {key: batch[key][at] for key in (*self.specs, "action")}
+        return Played(steps, batch["next", "reward"].squeeze(-1)[at], number)
 
     def _adapted_logits(self, batch: Data, theta: NamedWeights | None = None) -> Tensor:
         """Return logits of all trials after their adaptation, [trials, steps, num_actions]."""
-        others = [batch["before", key] for key in Episodes._fields[1:]]
-        before = Episodes(self._seen_before(batch), *others)
-        after = tuple(batch[key] for key in self.specs)
-        return vmap(self.model.adapted_logits, in_dims=(None, 0, 0))(theta or self.model.theta, before, after)
-
-    def _seen_before(self, batch: Data) -> NetInputs:
-        return tuple(batch["before", key] for key in self.specs)
+        after = {key: batch[key] for key in self.specs}
+        logits = vmap(self.model.adapted_logits, in_dims=(None, 0, 0))
+        return logits(theta or self.model.theta, steps_before(batch), after)
 
     def loss(self, batch: Data) -> TensorsByName:
         """Return the outer loss of `trials`, and the entropy's before the adaptation."""
         losses = {"loss_policy": self._outer_loss(batch, self._adapted_logits(batch))}
         if self.settings.entropy_coeff > 0:
             theta = self.model.theta
-            logits = self.model.logits(theta, self.model.start(theta), self._seen_before(batch))
+            logits = self.model.logits(theta, self.model.start(theta), steps_before(batch))
             entropies = entropy(logits.log_softmax(dim=-1))
             weight = -self.settings.entropy_coeff * batch["before", "weight"]
             losses["loss_entropy"] = (weight * entropies).sum(dim=1).mean()
@@ -465,3 +448,8 @@ class InnerLoop(Learner):
             "return_after": batch["measured", "after"],
             "trials": torch.full_like(batch["measured", "after"], len(batch["action"])),
         }
+
+
+def steps_before(batch: Data) -> Items:
+    """Return the part of `InnerLoop.trials` before the adaptation."""
+    return {key[1]: value for key, value in batch.items() if key[0] == "before"}

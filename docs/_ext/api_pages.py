@@ -125,7 +125,7 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "baselines.parts.recurrent_q",
             "baselines.rl2:TrialTrunk",
             "baselines.parts.networks",
-            "baselines.parts.inner_loop:InnerModel,Episodes,Played",
+            "baselines.parts.inner_loop:InnerModel,Played",
             "baselines.parts.gates:GatedNetwork",
             "baselines.update.update:UpdateState,update,Parts,make_optimiser,has_parts,parts_of,minimise,step",
             "baselines.update.trained:Trained",

@@ -18,7 +18,7 @@ from baselines.cavia import CAVIA, Context
 from baselines.maml import MAML, AllWeights
 from baselines.methods.scratch import Scratch
 from baselines.parts.gates import GatedLayer
-from baselines.parts.inner_loop import EPISODES, Episodes, Played, log_prob
+from baselines.parts.inner_loop import EPISODES, Played, log_prob
 from baselines.update.trust_region import conjugate_gradients, trust_region_step
 from ctgraph_rl import Block, CTGraphEnv, Curriculum, Evaluation, learn_curriculum
 from ctgraph_rl.learn.collect import agent_specs, collect
@@ -83,17 +83,17 @@ class Bandit(nn.Module):
         return self.arms.expand(*observation.shape[:-1], 2) + sum(context)
 
 
-PULLED = Episodes(
-    (torch.zeros(3, 1, dtype=torch.float64),),
-    action=torch.tensor([0, 1, 1]),
-    advantage=torch.tensor([1.0, -0.5, 2.0], dtype=torch.float64),
-    weight=torch.full((3,), 1 / 3, dtype=torch.float64),
-)
+PULLED = {
+    "observation": torch.zeros(3, 1, dtype=torch.float64),
+    "action": torch.tensor([0, 1, 1]),
+    "advantage": torch.tensor([1.0, -0.5, 2.0], dtype=torch.float64),
+    "weight": torch.full((3,), 1 / 3, dtype=torch.float64),
+}
 
 
-@pytest.mark.parametrize("kind", [AllWeights, partial(Context, num_context=2)])
+@pytest.mark.parametrize("kind", [AllWeights, Context])
 def test_the_inner_step_on_a_bandit_is_that_by_hand(kind):
-    model = kind(Bandit(), 0.3)
+    model = kind(Bandit(), ["observation"], 0.3, 2)
     theta = model.theta
     own = model.start(theta) if isinstance(model, AllWeights) else {"context": torch.zeros(2, dtype=torch.float64)}
 
@@ -170,8 +170,7 @@ def test_ppo_keeps_the_entropy_of_the_policy_before_the_adaptation(name):
 
 def test_steps_of_episodes_have_weights_returns_and_times():
     trial = Played(
-        (torch.zeros(1, 6, 2, dtype=torch.uint8),),
-        action=torch.zeros(1, 6, dtype=torch.int64),
+        {"observation": torch.zeros(1, 6, 2, dtype=torch.uint8)},
         reward=torch.tensor([[0.0, 0.0, 1.0, 0.0, 4.0, 9.0]]),
         number=torch.tensor([[1, 1, 1, 2, 2, 0]]),
     )
@@ -189,8 +188,7 @@ def test_advantages_are_what_the_baseline_misses_and_have_mean_0_and_deviation_1
     generator = torch.Generator().manual_seed(0)
     seen = torch.randint(0, 256, (1, 60, 5), generator=generator, dtype=torch.uint8)
     number = torch.arange(60).div(3, rounding_mode="floor").add(1).unsqueeze(0)
-    action = torch.zeros(1, 60, dtype=torch.int64)
-    linear = Played((seen,), action, 3.0 * net.flat(seen)[..., 2], number)
+    linear = Played({"observation": seen}, 3.0 * net.flat(seen)[..., 2], number)
     noise = linear._replace(reward=torch.randn(1, 60, generator=generator))
 
     fitted = linear.advantage(net, 0.0, linear.baseline(net, 0.0))
@@ -214,7 +212,7 @@ def test_a_row_adapts_while_it_acts_to_the_weights_of_which_it_learns(name):
     theta = {key: value.detach() for key, value in agent.model.theta.items()}
 
     for place, row in enumerate(rows.tolist()):
-        own = Episodes(tuple(value[place] for value in before.seen), *(value[place] for value in before[1:]))
+        own = {key: value[place] for key, value in before.items()}
         adapted = agent.model.adapt(theta, agent.model.start(theta), own)
         for key, value in adapted.items():
             acted = batch["next", policy.own_keys[key]][row, -1]
