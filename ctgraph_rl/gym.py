@@ -377,7 +377,7 @@ class StreamVectorEnv(CTGraphVectorEnv):
         stream: a `Stream`; None: ``curriculum=stream`` with ``settings``.
         seed: draws the tasks of a stream without a seed.
         task_ids: as in `CTGraphVectorEnv`, also all others but the tasks.
-        settings: such as ``num_tasks=1000``.
+        settings: such as ``num_tasks=1000``; none beside ``stream``.
 
     Raises:
         ValueError: for values out of range, and blocks that are not whole steps of the rows.
@@ -403,6 +403,9 @@ class StreamVectorEnv(CTGraphVectorEnv):
         life: int | None = None,
         **settings: Any,
     ) -> None:
+        shown = ", ".join(f"{name}={value!r:.40}" for name, value in settings.items())
+        rule = f"a stream that is given has its settings, got {shown} beside it: leave them out, or give no stream"
+        require((stream is None or not settings, rule))
         made = curriculum_named("stream", **settings) if stream is None else stream
         require((isinstance(made, Stream), f"stream must be a Stream, got {made!r:.80}"), seed_rule(seed))
         assert isinstance(made, Stream)

@@ -42,6 +42,8 @@ class SB3VecEnv(VecEnv):
 
     @takes_numbers
     def __init__(self, num_envs: int, task: Any = None, stream: Stream | None = None, **kwargs: Any) -> None:
+        both = f"a stream has its tasks, got task={task!r:.80} beside it: leave one of both out"
+        require((stream is None or task is None, both))
         same_step = AutoresetMode.SAME_STEP
         if stream is None:
             self.envs = CTGraphVectorEnv(num_envs, task, autoreset_mode=same_step, **kwargs)

@@ -116,6 +116,10 @@ def test_a_cleanrl_like_loop_learns_the_stream():
         ({"orders": "similar"}, "stream has no orders"),
         ({"seed": -1}, r"seed must be an integer in \[0, 2\*\*63\), got -1"),
         ({"stream": 5}, "stream must be a Stream, got 5"),
+        (
+            {"stream": curricula.load("stream", num_tasks=2), "num_tasks": 3, "depth": 1},
+            "^a stream that is given has its settings, got num_tasks=3, depth=1 beside it: leave them out",
+        ),
     ],
 )
 def test_a_value_out_of_range_is_refused(settings, message):

@@ -246,6 +246,18 @@ def test_regret_and_tasks_of_a_stream_reach_callbacks():
     assert seen[-1] == 2
 
 
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"num_tasks": 3}, "^a stream that is given has its settings, got num_tasks=3 beside it: leave them out"),
+        ({"task": "CT-SU-B1"}, "^a stream has its tasks, got task='CT-SU-B1' beside it: leave one of both out"),
+    ],
+)
+def test_a_stream_beside_a_task_or_settings_is_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        SB3VecEnv(8, stream=curricula.load("stream", num_tasks=2, num_frames=80), **given)
+
+
 @pytest.mark.slow
 def test_ppo_learns_a_stream():
     stream = curricula.load("stream", num_tasks=2, num_frames=64 * 512, depth=1, order="similar", seed=4)

@@ -13,7 +13,7 @@ from helpers.oracles import confounding, fully_observable, surjective
 
 from ctgraph_rl import CTGraph, Gradient, Needle, StateType, Task
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS, ct_graph
-from ctgraph_rl.tasks.observability import POLICIES, state_entropy, states_per_observation, transition_entropy
+from ctgraph_rl.tasks.observability import POLICIES, state_entropy, states_per_observation
 from ctgraph_rl.tasks.values import open_loop_ceiling
 
 State = tuple[StateType, tuple[int, ...]]
@@ -188,43 +188,3 @@ def test_the_open_loop_ceiling_of_other_rewards_is_refused_where_waiting_is_rand
     with pytest.raises(ValueError, match=message):
         open_loop_ceiling(replace(task, **change))
     assert open_loop_ceiling(replace(task, graph=CTGraph(2, 2), **change)) is not None
-
-
-def counted_transitions(task: Task, policy: str) -> tuple[float, float]:
-    """Bits a step of the next id and reward, for who knows the state and the action, and for who knows neither."""
-    pairs: dict[object, float] = defaultdict(float)
-    known = steps = 0.0
-    for state, mass in visits(task, policy).items():
-        if state[0] in ENDINGS:
-            continue
-        steps += mass
-        for action, chance in enumerate(probabilities(task, policy, state)):
-            after: dict[object, float] = defaultdict(float)
-            for (kind, path), share in following(task, state, action).items():
-                first, last = task.observations.ids(kind)
-                own = task.observations.is_unique(kind)
-                for shown in [path] if own else range(first, last + 1):
-                    pair = (kind, shown, kind == StateType.END and path == task.goal)
-                    after[pair] += share / (1 if own else last - first + 1)
-            for pair, share in after.items():
-                pairs[pair] += mass * chance * share
-                known -= mass * chance * share * math.log2(share) if share > 0 else 0.0
-    return known / steps, -sum(c / steps * math.log2(c / steps) for c in pairs.values() if c > 0)
-
-
-@pytest.mark.parametrize("policy", POLICIES)
-@pytest.mark.parametrize("make", [fully_observable, surjective, confounding])
-def test_the_entropy_of_transitions_is_that_of_all_transitions_counted(make, policy):
-    task = make(2, 2, 0.5, (1, 2))
-
-    informed = transition_entropy(task, policy)
-    uninformed = transition_entropy(task, policy, informed=False)
-
-    assert (informed, uninformed) == pytest.approx(counted_transitions(task, policy), abs=1e-9)
-
-
-def test_a_task_with_noisy_rewards_has_no_entropy_of_transitions():
-    task = replace(surjective(), reward_std=0.1)
-
-    with pytest.raises(ValueError, match="exact for a Needle reward"):
-        transition_entropy(task)
