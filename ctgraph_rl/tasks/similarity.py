@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -38,8 +37,8 @@ ON_THE_WAY = 0
 ELSEWHERE = 1
 """The two kinds of nodes of a collapsed tree."""
 
-ActionSets = dict[tuple[StateType, int], list[int]]
-"""Sets of actions by kind and level, each an integer with a bit per action."""
+ActionSets = dict[tuple[StateType, int], Tensor]
+"""Whether actions are optimal at nodes, by kind and level: bool [nodes, actions]."""
 
 
 def shared_decisions(tasks: Sequence[Task]) -> Tensor:
@@ -97,17 +96,17 @@ def observation_agreement(tasks: Sequence[Task], gamma: float = 1.0) -> Tensor:
             of more than `MAX_COMPARED_BYTES`.
     """
 
-    def share(one: dict[bytes, int], other: dict[bytes, int]) -> float:
+    def share(one: dict[bytes, tuple[bool, ...]], other: dict[bytes, tuple[bool, ...]]) -> float:
         shown = one.keys() & other.keys()
-        return sum(one[i] == other[i] != 0 for i in shown) / len(shown) if shown else math.nan
+        return sum(one[i] == other[i] and any(one[i]) for i in shown) / len(shown) if shown else math.nan
 
     found = []
     for choice in _choices(_tasks(tasks), gamma):
-        left: dict[bytes, int] = {}  # for each image, the actions that are optimal in all states that show it
+        left: dict[bytes, Tensor] = {}  # for each image, the actions that are optimal in all states that show it
         for ids, actions in _shown_with_actions(choice):
             for content in _contents(choice.task, ids):
                 left[content] = left.get(content, actions) & actions
-        found.append(left)
+        found.append({content: tuple(actions.tolist()) for content, actions in left.items()})
     return _matrix(found, share)
 
 
@@ -190,21 +189,16 @@ class _Choices:
         nodes = graph.nodes_to(graph.node_at(self.task.goal))
         return [node - graph.first_node(level) for level, node in enumerate(nodes)]
 
-    def of_path(self, kind: StateType, path: tuple[int, ...]) -> int:
+    def of_path(self, kind: StateType, path: tuple[int, ...]) -> Tensor:
         """The set at a node of a collapsed tree."""
         level = len(path)
         return self.sets[kind, level][ON_THE_WAY if path == self.task.goal[:level] else ELSEWHERE]
 
-    def of_nodes(self, kind: StateType, level: int, nodes: Sequence[int]) -> list[int]:
+    def of_nodes(self, kind: StateType, level: int, nodes: Tensor) -> Tensor:
         """The sets at nodes by number within a level."""
-        sets = self.sets[kind, level]
-        goal = self.goal_nodes[level]
-        return [sets[ON_THE_WAY if node == goal else ELSEWHERE] if self.collapsed else sets[node] for node in nodes]
-
-    def in_use(self, kind: StateType) -> Iterator[int]:
-        for (of_kind, level), sets in self.sets.items():
-            if of_kind == kind:
-                yield from sets[:1] if level == 0 else sets
+        if self.collapsed:
+            nodes = torch.where(nodes == self.goal_nodes[level], ON_THE_WAY, ELSEWHERE)
+        return self.sets[kind, level][nodes]
 
 
 def _choices(tasks: tuple[Task, ...], gamma: float) -> list[_Choices]:
@@ -232,17 +226,11 @@ def _optimal_sets(task: Task, gamma: float, num_actions: int) -> ActionSets:
     return sets
 
 
-def _best(values: Tensor, fails: float, num_actions: int, first: int, margin: float) -> list[int]:
+def _best(values: Tensor, fails: float, num_actions: int, first: int, margin: float) -> Tensor:
     """The sets of best actions: ``values`` [n, m] are those from ``first`` on; any other fails."""
-    best = values.amax(-1).clamp_min(fails) - margin
-    rows, which = torch.unique(values >= best.unsqueeze(-1), dim=0, return_inverse=True)
-    tried = ((1 << values.shape[1]) - 1) << first
-    others = (1 << num_actions) - 1 - tried
-    packed = np.packbits(rows.numpy(), axis=1, bitorder="little")
-    chosen = [int.from_bytes(row.tobytes(), "little") << first for row in packed]
-    sets = []
-    for row, failing in zip(which.tolist(), (fails >= best).tolist(), strict=True):
-        sets.append(chosen[row] | others if failing else chosen[row])
+    best = values.amax(-1, keepdim=True).clamp_min(fails) - margin
+    sets = (fails >= best).repeat(1, num_actions)
+    sets[:, first : first + values.shape[1]] = values >= best
     return sets
 
 
@@ -250,41 +238,32 @@ def _equal_on_ways(one: _Choices, other: _Choices, kind: StateType, level: int, 
     """Equal states of a level: those on the ways to two needles singly, all others at once."""
     ways = {one.task.goal[:level], other.task.goal[:level]}
     inside = [path for path in ways if max(path, default=1) <= b]
-    equal = sum(one.of_path(kind, path) == other.of_path(kind, path) for path in inside)
-    others_equal = one.sets[kind, level][ELSEWHERE] == other.sets[kind, level][ELSEWHERE]
+    equal = sum(one.of_path(kind, path).equal(other.of_path(kind, path)) for path in inside)
+    others_equal = one.sets[kind, level][ELSEWHERE].equal(other.sets[kind, level][ELSEWHERE])
     return equal + (b**level - len(inside)) * others_equal
 
 
 def _equal_everywhere(one: _Choices, other: _Choices, kind: StateType, level: int, b: int) -> int:
     sets = []
     for choice in (one, other):
-        nodes = _nodes(choice.task.graph.branching_factor, b, level)
+        nodes = torch.zeros(1, dtype=torch.int64, device="cpu")
+        for _ in range(level):
+            below = choice.task.graph.branching_factor * nodes.unsqueeze(1)
+            nodes = (below + torch.arange(b, device="cpu")).flatten()
         sets.append(choice.of_nodes(kind, level, nodes))
-    return sum(a == z for a, z in zip(*sets, strict=True))
+    return int((sets[0] == sets[1]).all(1).sum())
 
 
-@lru_cache(maxsize=64)
-def _nodes(own_b: int, b: int, level: int) -> list[int]:
-    if level == 0:
-        return [0]
-    nodes: list[int] = []
-    for node in _nodes(own_b, b, level - 1):
-        nodes += range(node * own_b, node * own_b + b)
-    return nodes
-
-
-def _shown_with_actions(choice: _Choices) -> Iterator[tuple[Sequence[int], int]]:
+def _shown_with_actions(choice: _Choices) -> Iterator[tuple[Sequence[int], Tensor]]:
     task = choice.task
     for kind in CHOOSING:
-        if not task.observations.is_unique(kind):
-            actions = -1
-            for each in choice.in_use(kind):
-                actions &= each
-            yield _ids(task, kind), actions
-            continue
         for level in _levels(task, kind):
+            if not task.observations.is_unique(kind):
+                sets = choice.sets[kind, level]
+                yield _ids(task, kind), sets[: len(sets) if level else 1].all(0)
+                continue
             ids = _unique_ids(task, kind, level)
-            sets = choice.of_nodes(kind, level, range(len(ids)))
+            sets = choice.of_nodes(kind, level, torch.arange(len(ids), device="cpu"))
             for number, actions in zip(ids, sets, strict=True):
                 yield [number], actions
 
