@@ -6,18 +6,8 @@ from collections.abc import Iterator
 
 from yaml_settings import ALONE, escaped
 
-from ctgraph_rl.board.standings.track_ceilings import Ceilings, ceilings_of
-from ctgraph_rl.board.tracks import HELD_OUT_SEEDS, TUNING_SEEDS, Track, Variant, tracks
-
-COLUMNS = {
-    "optimal": "optimum",
-    "one_policy": "one policy for tasks that look the same",
-    "search": "best search",
-    "memoryless": "without memory",
-    "open_loop": "without observations",
-    "random": "random policy",
-}
-"""Ceilings by the headings of their columns; one that no variant of a track has is left out."""
+from ctgraph_rl.board.standings.track_ceilings import ceilings_of, write_ceiling
+from ctgraph_rl.board.tracks import HELD_OUT_SEEDS, TUNING_SEEDS, Track, tracks
 
 
 def track_cards() -> Iterator[tuple[str, str]]:
@@ -70,17 +60,13 @@ def _card(track: Track) -> str:
 def _table(track: Track) -> str:
     """Return the variants of a track with what their tasks allow."""
     found = [(variant, ceilings_of(variant.curriculum)) for variant in track.variants]
-    shown = [key for key in COLUMNS if any(getattr(ceilings, key) is not None for _, ceilings in found)]
-    head = ["rung"] * (len(track.rungs) > 1) + ["given", "settings", "steps", *(COLUMNS[key] for key in shown)]
-    head.append("frames to a random policy's first reward")
-    rows = [_row(track, variant, ceilings, shown) for variant, ceilings in found]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows))
-
-
-def _row(track: Track, variant: Variant, ceilings: Ceilings, shown: list[str]) -> list[str]:
-    settings = " ".join(f"`{setting}`" for setting in variant.settings)
-    values = ["" if getattr(ceilings, key) is None else f"{getattr(ceilings, key):.4g}" for key in shown]
-    frames = ceilings.random_frames
-    rung = [variant.rung] * (len(track.rungs) > 1)
-    last = f"{frames:,.0f}" if frames < 1e7 else f"{frames:.1e}"
-    return [*rung, variant.given, settings, f"{variant.curriculum.num_frames:,}", *values, last]
+    shown = [name for name in found[0][1] if any(ceilings[name] is not None for _, ceilings in found)]
+    rung = ["rung"] * (len(track.rungs) > 1)
+    rows = [[*rung, "given", "settings", "steps", *shown]]
+    rows.append(["---"] * len(rows[0]))
+    for variant, ceilings in found:
+        settings = " ".join(f"`{setting}`" for setting in variant.settings)
+        values = ["" if ceilings[name] is None else write_ceiling(ceilings[name]) for name in shown]
+        own = [variant.rung] * len(rung)
+        rows.append([*own, variant.given, settings, f"{variant.curriculum.num_frames:,}", *values])
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in rows)

@@ -67,7 +67,7 @@ def test_what_the_page_says_of_single_lines_holds(made):
     assert [table.standings[0].entry.scores.count(1.0) for table in deep] == [10, 10, 4, 0]
     assert [table.standings[0].entry.scores.count(0.0) for table in deep] == [0, 0, 6, 10]
     assert {table.variant.curriculum.num_frames for table in deep} == {102_400}
-    needed = f"{deep[1].ceilings.random_frames:,.0f}"
+    needed = f"{deep[1].ceilings['frames to the first reward of a random policy, on the hardest task']:,.0f}"
     assert f"A random policy needs {needed} for its first reward at depth 6" in page
 
     kept = alone["forgetting", ""].standings[0].entry
@@ -88,7 +88,7 @@ def test_what_the_page_says_of_single_lines_holds(made):
     adapted = [f"{score:.2f}" for score in sorted(alone["adaptation", "depth 2"].standings[0].entry.scores)]
     assert "seven of ten seeds are at the best search, at 0.61 to 0.64, and three at 0.24 to 0.39" in page
     assert (adapted[0], adapted[2], adapted[3], adapted[-1]) == ("0.24", "0.39", "0.61", "0.64")
-    assert f"{alone['adaptation', 'depth 2'].ceilings.search:.3f}" == "0.625"
+    assert f"{alone['adaptation', 'depth 2'].ceilings['best search for a goal that is not known']:.3f}" == "0.625"
 
     shared = alone["sharing", ""].standings[0].entry.scores
     assert "20 of 28 tasks in eight of ten seeds, 21 in two" in page

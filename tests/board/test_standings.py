@@ -21,7 +21,7 @@ from ctgraph_rl.board.standings import board_formats as formats
 from ctgraph_rl.board.standings.board_page import html
 from ctgraph_rl.board.standings.board_tables import BoardTable, tables
 from ctgraph_rl.board.standings.entries import BoardEntry
-from ctgraph_rl.board.standings.track_ceilings import ceilings_of
+from ctgraph_rl.board.standings.track_ceilings import ceilings_of, write_ceiling
 from ctgraph_rl.board.tracks import Track, track
 from ctgraph_rl.board.verification import Verification
 from ctgraph_rl.report import statistics
@@ -30,6 +30,12 @@ pytest.importorskip("scipy")
 pytest.importorskip("jinja2")
 
 SMALL, FORGETTING = track("small"), track("forgetting")
+
+ONE = "one policy for all tasks that look the same, at most"
+SEARCH = "best search for a goal that is not known"
+MEMORYLESS = "best policy without memory"
+OPEN_LOOP = "best sequence of actions without observations"
+FRAMES = "frames to the first reward of a random policy, on the hardest task"
 
 
 def entry(name: str, scores: Sequence[float | None], of: Track = SMALL, variant: int = 0, **more: Any) -> BoardEntry:
@@ -131,21 +137,27 @@ def test_two_methods_of_one_name_are_named_apart():
 @pytest.mark.parametrize(
     ("curriculum", "expected"),
     [
-        (SMALL.variants[0].curriculum, {"optimal": 1.0, "one_policy": None, "random": 1 / 243, "random_frames": 651.0}),
-        (SMALL.variants[3].curriculum, {"one_policy": 1 / 4, "memoryless": 1.0}),
-        (replace(curricula.load("ct8_md"), protocol=Protocol("hidden")), {"one_policy": 4 / 8}),  # 11, 111, 1111, 11111
-        (replace(curricula.load("ct28"), protocol=Protocol("hidden")), {"one_policy": 1.0}),  # images say which family
-        (curricula.load("su_b1_changing_goals"), {"search": 5 / 8, "memoryless": None, "one_policy": None}),
-        (curricula.load("su_b1_changing_goals", depth=3), {"search": 9 / 16, "optimal": 1.0}),
-        (curricula.load("co_hard"), {"memoryless": 1 / 4, "open_loop": pytest.approx(0.1**2), "search": None}),
+        (SMALL.variants[0].curriculum, {"optimum": 1.0, ONE: None, "random policy": 1 / 243, FRAMES: 651.0}),
+        (SMALL.variants[3].curriculum, {ONE: 1 / 4, MEMORYLESS: 1.0}),
+        (replace(curricula.load("ct8_md"), protocol=Protocol("hidden")), {ONE: 4 / 8}),  # 11, 111, 1111, 11111
+        (replace(curricula.load("ct28"), protocol=Protocol("hidden")), {ONE: 1.0}),  # images say which family
+        (curricula.load("su_b1_changing_goals"), {SEARCH: 5 / 8, MEMORYLESS: None, ONE: None}),
+        (curricula.load("su_b1_changing_goals", depth=3), {SEARCH: 9 / 16, "optimum": 1.0}),
+        (curricula.load("co_hard"), {MEMORYLESS: 1 / 4, OPEN_LOOP: 0.1**2, SEARCH: None}),
     ],
 )
 def test_ceilings_are_those_by_hand(curriculum, expected):
-    found = ceilings_of(curriculum)._asdict()
+    found = ceilings_of(curriculum)
 
     assert {key: found[key] for key in expected} == {
         key: value if value is None else pytest.approx(value) for key, value in expected.items()
     }
+
+
+def test_ceilings_have_four_digits_and_numbers_of_frames_whole_ones():
+    assert list(map(write_ceiling, (1.0, 0.00411522, 99.96, 651.4, 12_345.0, 9.9e9))) == [
+        *("1", "0.004115", "99.96", "651", "12,345", "9.9e+09")
+    ]
 
 
 @pytest.fixture

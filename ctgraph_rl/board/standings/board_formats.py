@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from ctgraph_rl.board.standings.board_tables import BoardTable, Standing, is_significant
-from ctgraph_rl.board.standings.track_ceilings import in_words
+from ctgraph_rl.board.standings.track_ceilings import write_ceiling
 from ctgraph_rl.board.verification import STATES
 from ctgraph_rl.log.escape import csv_text
 from ctgraph_rl.report.formats import MEANS, measure_name
@@ -73,7 +73,10 @@ def facts(table: BoardTable) -> list[tuple[str, str]]:
         ("steps", f"{curriculum.num_frames:,}"),
         ("seeds", f"{seeds[0]} to {seeds[-1]}" if whole else ", ".join(map(str, seeds))),
     ]
-    return [*about, *in_words(table.ceilings)]
+    for name, value in table.ceilings.items():
+        if value is not None:
+            about.append((name, write_ceiling(value)))
+    return about
 
 
 def verdicts(table: BoardTable) -> list[tuple[str, str, str]]:

@@ -14,7 +14,7 @@ from functools import cached_property
 from itertools import combinations
 
 from ctgraph_rl.board.standings.entries import BoardEntry, names_of
-from ctgraph_rl.board.standings.track_ceilings import Ceilings, ceilings_of
+from ctgraph_rl.board.standings.track_ceilings import ceilings_of
 from ctgraph_rl.board.tracks import Track, Variant
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.bounds_of_runs import bounds_of_curriculum
@@ -71,7 +71,7 @@ class BoardTable:
         return ", ".join(filter(None, (self.track.id, self.variant.rung, f"given: {self.variant.given}")))
 
     @cached_property
-    def ceilings(self) -> Ceilings:
+    def ceilings(self) -> dict[str, float | None]:
         """What its tasks allow."""
         return ceilings_of(self.variant.curriculum)
 

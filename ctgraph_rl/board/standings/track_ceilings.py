@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 from ctgraph_rl.log.scores import optimal_values
 from ctgraph_rl.metrics import Undefined
@@ -14,61 +13,33 @@ from ctgraph_rl.tasks.task import Task, are_graphs
 from ctgraph_rl.tasks.values import is_needle, memoryless_ceiling, open_loop_ceiling, random_frames_to_goal
 
 
-class Ceilings(NamedTuple):
-    """Undiscounted means over the tasks of a curriculum; None where there is no closed form."""
-
-    optimal: float | None  # of a policy that knows the goal
-    one_policy: float | None  # of the best policy that does not distinguish tasks that look the same; at most
-    search: float | None  # of the best search, where goals change and an evaluation plays every goal's episodes
-    memoryless: float | None  # of a policy that remembers nothing within an episode
-    open_loop: float | None  # of a sequence of actions that ignores all observations
-    random: float | None  # of the uniformly random policy
-    random_frames: float | None  # frames that it needs for its first reward on the hardest task
-
-
-def ceilings_of(curriculum: Curriculum) -> Ceilings:
-    """Return what the tasks of a curriculum allow."""
+def ceilings_of(curriculum: Curriculum) -> dict[str, float | None]:
+    """Return undiscounted means over the tasks of a curriculum by their names; None where there is no closed form."""
     tasks = curriculum.tasks
     if not are_graphs(tasks):
         best = optimal_values(tasks)
-        optimal = None if isinstance(best, Undefined) else best.mean().item()
-        return Ceilings(optimal, *[None] * (len(Ceilings._fields) - 1))
+        return {"optimum": None if isinstance(best, Undefined) else best.mean().item()}
     changes = any(task.goal_change is not None for task in tasks)
     plain = all(map(_is_plain, tasks))
     episodes = curriculum.evaluation.episodes_per_row
     plays_all = {task.graph.num_end_states for task in tasks} == {episodes}
     searches = plain and plays_all and all(task.goal_change == (episodes, episodes) for task in tasks)
-    return Ceilings(
-        optimal=_mean(tasks, lambda task: task.optimal_value(1.0)),
-        one_policy=_one_policy(tasks, curriculum.protocol),
-        search=(episodes + 1) / (2 * episodes) if searches else None,
-        memoryless=None if changes else _mean(tasks, memoryless_ceiling),
-        open_loop=None if changes else _mean(tasks, open_loop_ceiling),
-        random=_mean(tasks, lambda task: task.graph.reward_prob_random * task.goal_reward) if plain else None,
-        random_frames=max(map(random_frames_to_goal, tasks)),
-    )
-
-
-def in_words(ceilings: Ceilings) -> list[tuple[str, str]]:
-    """Return names and values of ceilings for readers, without those that have no closed form."""
-    names = {
-        "optimal": "optimum",
-        "one_policy": "one policy for all tasks that look the same, at most",
-        "search": "best search for a goal that is not known",
-        "memoryless": "best policy without memory",
-        "open_loop": "best sequence of actions without observations",
-        "random": "random policy",
+    return {
+        "optimum": _mean(tasks, lambda task: task.optimal_value(1.0)),
+        "one policy for all tasks that look the same, at most": _one_policy(tasks, curriculum.protocol),
+        "best search for a goal that is not known": (episodes + 1) / (2 * episodes) if searches else None,
+        "best policy without memory": None if changes else _mean(tasks, memoryless_ceiling),
+        "best sequence of actions without observations": None if changes else _mean(tasks, open_loop_ceiling),
+        "random policy": _mean(tasks, lambda task: task.graph.reward_prob_random * task.goal_reward) if plain else None,
+        "frames to the first reward of a random policy, on the hardest task": max(map(random_frames_to_goal, tasks)),
     }
-    shown = []
-    for key, name in names.items():
-        value = getattr(ceilings, key)
-        if value is not None:
-            shown.append((name, f"{value:.3g}"))
-    frames = ceilings.random_frames
-    if frames is not None:
-        count = f"{frames:,.0f}" if frames < 1e7 else f"{frames:.1e}"
-        shown.append(("frames to its first reward, on the hardest task", count))
-    return shown
+
+
+def write_ceiling(value: float) -> str:
+    """Return a ceiling in four digits, a number of frames in whole ones."""
+    if value < 100:
+        return f"{value:.4g}"
+    return f"{value:,.0f}" if value < 1e7 else f"{value:.1e}"
 
 
 def _mean(tasks: Sequence[Task], value: Callable[[Task], float]) -> float | None:

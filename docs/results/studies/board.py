@@ -8,7 +8,6 @@ from pathlib import Path
 from ctgraph_rl.board.standings.board_formats import columns
 from ctgraph_rl.board.standings.board_page import write_board
 from ctgraph_rl.board.standings.board_tables import BoardTable
-from ctgraph_rl.board.standings.track_ceilings import Ceilings
 from ctgraph_rl.board.tracks import tracks
 from ctgraph_rl.draw.style import new_figure, save_figure
 from studies.raw import HERE, fill, table
@@ -69,13 +68,15 @@ def _line(of: BoardTable) -> list[str]:
     return [learned, of.variant.given, *about, _landmarks(of.ceilings)]
 
 
-def _landmarks(of: Ceilings) -> str:
+def _landmarks(ceilings: dict[str, float | None]) -> str:
     """Return the returns of policies that lack what a track is about."""
-    parts = [f"random {of.random:.2g}"]
-    if of.memoryless is not None and of.memoryless < 1:
-        parts.append(f"no memory {of.memoryless:.2f}")
-    if of.search is not None:
-        parts.append(f"best search {of.search:.3f}")
+    parts = [f"random {ceilings['random policy']:.2g}"]
+    memoryless = ceilings["best policy without memory"]
+    search = ceilings["best search for a goal that is not known"]
+    if memoryless is not None and memoryless < 1:
+        parts.append(f"no memory {memoryless:.2f}")
+    if search is not None:
+        parts.append(f"best search {search:.3f}")
     return ", ".join(parts)
 
 
