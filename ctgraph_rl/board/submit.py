@@ -15,7 +15,6 @@ from ctgraph_rl.board.method_yaml import TEMPLATE, completed, fact_rules, facts_
 from ctgraph_rl.board.rescore import curriculum_rule, entry_rule, oracle_rule, seed_rules
 from ctgraph_rl.board.submission import (
     LOGS,
-    NAME,
     SUBMISSION,
     Submission,
     SubmittedRun,
@@ -26,7 +25,7 @@ from ctgraph_rl.board.submission import (
     submission_text,
 )
 from ctgraph_rl.board.tracks import Track, track
-from ctgraph_rl.checks import ReadOnlyValues, Rule, repeated, require
+from ctgraph_rl.checks import ReadOnlyValues, Rule, require
 from ctgraph_rl.disk import make_folder, new_folder, require_new, write_whole
 from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.escape import listed, refused_by, terminal_text
@@ -62,8 +61,8 @@ def submit(
     runs = _found(paths, only or {})
     curriculum = _checked(runs, method, of_track)
     lines = []
-    for run, name in zip(runs, _names(runs), strict=True):
-        lines.append(_line(run, name, method["failed"].get(run.seed)))
+    for run in runs:
+        lines.append(_line(run, method["failed"].get(run.seed)))
     facts = facts_of(curriculum.protocol, lines)
     require(*fact_rules(method, facts, lines, len(curriculum.tasks)))
     about = completed(method, facts)
@@ -120,13 +119,7 @@ def _checked(runs: Sequence[Run], method: ReadOnlyValues, of_track: Track | None
     return first
 
 
-def _names(runs: Sequence[Run]) -> list[str]:
-    names = [run.path.resolve().name for run in runs]
-    usable = all(map(NAME.fullmatch, names)) and not repeated(map(str.lower, names))
-    return names if usable else [f"seed{run.seed}" for run in runs]
-
-
-def _line(run: Run, name: str, reason: str | None) -> SubmittedRun:
+def _line(run: Run, reason: str | None) -> SubmittedRun:
     log = RunLog.read(run.path / LOG)
     agent = run.path / AGENT
     state = None
@@ -136,7 +129,7 @@ def _line(run: Run, name: str, reason: str | None) -> SubmittedRun:
         except ValueError as error:
             raise ValueError(f"{agent} {error}: save a state_dict there, or nothing") from error
     return SubmittedRun(
-        run=name,
+        run=f"seed{run.seed}",
         seed=run.seed,
         reason=reason,
         group=tuple(run.about.get("together") or ()),

@@ -15,10 +15,7 @@ import signal
 import sys
 from collections.abc import Sequence
 from datetime import timedelta
-from functools import partial
-from inspect import unwrap
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import NamedTuple
 
 from ctgraph_rl import parsers
@@ -33,8 +30,7 @@ from ctgraph_rl.checks import NamedValues, Rule, is_int, is_real, require
 from ctgraph_rl.disk import make_folder, write_whole
 from ctgraph_rl.log.escape import refused_by, terminal_lines, terminal_text
 from ctgraph_rl.log.files import locked
-from ctgraph_rl.log.provenance import is_ours, machine, targets, versions
-from ctgraph_rl.packages import check_packages
+from ctgraph_rl.log.provenance import machine, targets, versions
 from ctgraph_rl.parsers import LEVELS, LIMIT_TIMES
 from ctgraph_rl.portable import cpu_model
 from ctgraph_rl.runs.sweep import sigterm_exits
@@ -139,32 +135,11 @@ def _time(seconds: float) -> str:
 
 
 def code_in_words(submission: Submission) -> str:
-    """Return whose code a submission runs."""
+    """Return the names of all code that a submission runs, and where its author says that it is from."""
     entry = submission.method["entry_point"]
     code = submission.method["code"]
-    named = [entry] if entry is not None else dict.fromkeys(targets(submission.config))
-    others = [name for name in named if name == entry or not is_of_this_package(name)]
-    source = f"of {code['repository']} at {code['commit']}"
-    return f"{', '.join(others)} {source}" if others else "of this package, as the configuration names it"
-
-
-def is_of_this_package(name: str) -> bool:
-    """Return whether this package defines a dotted name; names that its modules import do not count.
-
-    Raises:
-        ValueError: if another package has the name of one of ours.
-    """
-    if not is_ours(name):
-        return False
-    check_packages()
-    try:
-        found = resolve_name(name)
-    except (ImportError, AttributeError, ValueError):
-        return False
-    made = unwrap(found)
-    if isinstance(made, partial):
-        made = unwrap(made.func)
-    return is_ours(str(getattr(made, "__module__", None)))
+    named = dict.fromkeys(targets(submission.config)) if entry is None else [entry]
+    return f"{', '.join(named)} of {code['repository']} at {code['commit']}"
 
 
 def ask(lines: Sequence[str], yes: bool) -> None:

@@ -118,7 +118,7 @@ def test_a_log_that_was_exchanged_since_is_left_out_and_named(tiny_home, submiss
 
     entries, (problem,) = read_entries([submission.path], tiny_home / "conf")
 
-    assert not entries and "the log of tiny-seed0 is another one than the submission names" in problem.reason
+    assert not entries and "the log of seed0 is another one than the submission names" in problem.reason
 
 
 def test_a_submission_to_an_earlier_version_of_a_track_is_in_a_table_of_its_own_and_fails_under_the_new_one(

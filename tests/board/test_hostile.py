@@ -53,7 +53,7 @@ def test_a_run_names_no_file_elsewhere(submission, name):
         checked(submission)
 
 
-@pytest.mark.parametrize("file", ["submission.json", "logs/tiny-seed1.jsonl.gz"])
+@pytest.mark.parametrize("file", ["submission.json", "logs/seed1.jsonl.gz"])
 @pytest.mark.parametrize("what", ["pipe", "device", "folder", "loop"])
 def test_what_is_no_file_is_refused_and_nothing_waits_for_it(submission, file, what):
     path = submission.path / file

@@ -19,7 +19,7 @@ from ctgraph_rl.board.rescore import RESCORED, Check, rescore, scores_of
 from ctgraph_rl.board.submission import Submission, log_sum, packed, read_log, read_submission
 from ctgraph_rl.log import provenance
 
-LOG = "logs/tiny-seed1.jsonl.gz"
+LOG = "logs/seed1.jsonl.gz"
 
 
 def edit_log(folder: Path, change: Callable[[list[dict]], object], with_sum: bool = False) -> RunLog:
@@ -54,7 +54,7 @@ def test_a_tampered_log_is_found_by_its_sum_and_its_scores_are_no_others_without
     edit_log(submission.path, better)
 
     assert found(submission).keys() == {"sum of the log"}
-    with pytest.raises(ValueError, match="the log of tiny-seed1 is another one than the submission names: restore it"):
+    with pytest.raises(ValueError, match="the log of seed1 is another one than the submission names: restore it"):
         scores_of(submission, submission.runs[1])
 
 
@@ -110,7 +110,7 @@ def test_a_log_that_leaves_an_evaluation_out_or_has_one_twice_or_ends_early_is_f
     assert "missing (frames, task, episodes): (0, 2, 2)" in found(submission)["evaluations"]
 
     edit_log(submission.path, lambda lines: lines.__delitem__(slice(-20, None)))
-    assert found(submission)["frames"].startswith("tiny-seed1: 256; ")
+    assert found(submission)["frames"].startswith("seed1: 256; ")
 
 
 def test_the_command_writes_what_it_found_and_exits_with_1_where_something_differs(
@@ -138,7 +138,7 @@ def test_the_command_writes_what_it_found_and_exits_with_1_where_something_diffe
         verify.main()
     second = json.loads((submission.path / "verification.json").read_text())
     assert (second["level"], second["digest"] == first["digest"]) == ("none", False)
-    assert "- tiny-seed0: config: expected equal settings, found agent.gamma=0.99 instead of 0.98" in (
+    assert "- seed0: config: expected equal settings, found agent.gamma=0.99 instead of 0.98" in (
         capsys.readouterr().out.splitlines()
     )
 

@@ -62,18 +62,18 @@ def test_what_is_no_submission_is_refused_with_the_file_and_the_key(submission, 
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"run": "../tiny-seed1"}, r"run of '../tiny-seed1' must be a name of a file, got '../tiny-seed1'"),
-        ({"run": "tiny-seed0"}, "names a run twice: tiny-seed0"),
+        ({"run": "../seed1"}, r"run of '../seed1' must be a name of a file, got '../seed1'"),
+        ({"run": "seed0"}, "names a run twice: seed0"),
         ({"seed": 0}, "has a seed twice: 0"),
-        ({"seed": "1"}, "seed of 'tiny-seed1' must be an integer >= 0, got '1'"),
-        ({"seed": True}, "seed of 'tiny-seed1' must be an integer >= 0, got True"),
-        ({"seconds": 1e9 + 0.1}, r"seconds of 'tiny-seed1' must be a number in 0..1,000,000,000, got 1000000000.1"),
-        ({"reason": 5}, "reason of 'tiny-seed1' must be a text or null, got 5"),
-        ({"group": [0, "x"]}, "group of 'tiny-seed1' must be a list of seeds"),
-        ({"log_sha256": "x"}, "log_sha256 of 'tiny-seed1' must be 64 hexadecimal digits"),
-        ({"agent_sha256": ""}, "agent_sha256 of 'tiny-seed1' must be 64 hexadecimal digits or null"),
-        ({"agent_bytes": -1}, "agent_bytes of 'tiny-seed1' must be an integer >= 0 or null, got -1"),
-        ({"experts": ["0" * 64]}, "experts of 'tiny-seed1' must be empty"),
+        ({"seed": "1"}, "seed of 'seed1' must be an integer >= 0, got '1'"),
+        ({"seed": True}, "seed of 'seed1' must be an integer >= 0, got True"),
+        ({"seconds": 1e9 + 0.1}, r"seconds of 'seed1' must be a number in 0..1,000,000,000, got 1000000000.1"),
+        ({"reason": 5}, "reason of 'seed1' must be a text or null, got 5"),
+        ({"group": [0, "x"]}, "group of 'seed1' must be a list of seeds"),
+        ({"log_sha256": "x"}, "log_sha256 of 'seed1' must be 64 hexadecimal digits"),
+        ({"agent_sha256": ""}, "agent_sha256 of 'seed1' must be 64 hexadecimal digits or null"),
+        ({"agent_bytes": -1}, "agent_bytes of 'seed1' must be an integer >= 0 or null, got -1"),
+        ({"experts": ["0" * 64]}, "experts of 'seed1' must be empty"),
         ({"more": 1}, "a run must have run, seed, reason"),
     ],
 )
@@ -85,8 +85,8 @@ def test_a_run_out_of_range_is_refused(submission, values, message):
 
 
 def test_without_a_file_it_names_the_file_is_named(submission):
-    (submission.path / "logs" / "tiny-seed0.jsonl.gz").unlink()
-    with pytest.raises(ValueError, match=r"lacks logs/tiny-seed0.jsonl.gz, which submission.json names"):
+    (submission.path / "logs" / "seed0.jsonl.gz").unlink()
+    with pytest.raises(ValueError, match=r"lacks logs/seed0.jsonl.gz, which submission.json names"):
         read_submission(submission.path, submission.track)
 
     (submission.path / SUBMISSION).unlink()
@@ -96,11 +96,11 @@ def test_without_a_file_it_names_the_file_is_named(submission):
 
 def test_no_log_is_unpacked_beyond_its_limit_and_a_torn_one_is_refused(submission, monkeypatch):
     run = submission.runs[0]
-    log = submission.path / "logs" / "tiny-seed0.jsonl.gz"
+    log = submission.path / "logs" / "seed0.jsonl.gz"
 
     with monkeypatch.context() as small:
         small.setattr("ctgraph_rl.board.submission.MOST_BYTES_OF_A_LOG", 1000)
-        with pytest.raises(ValueError, match=r"tiny-seed0.jsonl.gz (has|holds more than) .*1,000"):
+        with pytest.raises(ValueError, match=r"seed0.jsonl.gz (has|holds more than) .*1,000"):
             submission.log(run)
     whole = log.read_bytes()
     for content in (whole[:-20], zlib.compress(b"no gzip"), whole + b"more"):
@@ -109,7 +109,7 @@ def test_no_log_is_unpacked_beyond_its_limit_and_a_torn_one_is_refused(submissio
             submission.log(run)
     log.unlink()
     log.symlink_to(submission.path / "verification.json")
-    with pytest.raises(ValueError, match="lacks logs/tiny-seed0"):
+    with pytest.raises(ValueError, match="lacks logs/seed0"):
         read_submission(submission.path, submission.track)
 
 

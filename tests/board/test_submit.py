@@ -48,7 +48,7 @@ def test_a_submission_has_a_line_for_each_seed_and_what_the_logs_give(tiny_submi
     made, run_dir = tiny_submission, tiny_home / "runs" / "tiny-seed1"
     second, log = made.runs[1], RunLog.read(run_dir / "run.jsonl")
 
-    assert (second.run, second.seed, second.finished, second.group) == ("tiny-seed1", 1, True, ())
+    assert (second.run, second.seed, second.finished, second.group) == ("seed1", 1, True, ())
     assert made.curriculum == tiny_track.curriculum
     assert second.log_sha256 == log_sum(log) == log_sum(made.log(second))
     assert second.agent_sha256 == sum_of_state(torch.load(run_dir / "agent.pt", weights_only=True))
@@ -184,7 +184,7 @@ def test_only_chooses_runs_by_a_setting(runs, tiny_track, method):
 
     made = submit([runs], runs.parent / "made", method, tiny_track, {"agent.gamma": 0.99})
 
-    assert [run.run for run in made.runs] == ["tiny-seed0", "tiny-seed1"]
+    assert [run.run for run in made.runs] == ["seed0", "seed1"]
     with pytest.raises(ValueError, match=r"no run is left by --only; there are agent.gamma=0.5, 0.99"):
         submit([runs], runs.parent / "more", method, tiny_track, {"agent.gamma": 0.7})
 
@@ -256,7 +256,7 @@ def test_a_failed_run_that_is_accounted_for_is_a_line_with_its_reason(runs, tiny
     made = submit([runs], runs.parent / "made", {**method, "failed": {1: "the loss was nan"}}, tiny_track)
 
     assert [(run.reason, run.agent_sha256 is None) for run in made.runs] == [(None, False), ("the loss was nan", True)]
-    assert made.method["failed"] == {1: "the loss was nan"} and [run.run for run in made.finished] == ["tiny-seed0"]
+    assert made.method["failed"] == {1: "the loss was nan"} and [run.run for run in made.finished] == ["seed0"]
 
 
 def test_what_fails_while_it_is_written_leaves_nothing_and_what_is_there_is_never_replaced(
@@ -302,7 +302,10 @@ def test_a_learner_of_others_is_submitted_with_the_entry_point_that_runs_it_agai
         submit([tmp_path / "runs"], tmp_path / "made", method, tiny_track)
     made = submit([tmp_path / "runs"], tmp_path / "made", {**method, "entry_point": "test_submit:learn"}, tiny_track)
 
-    assert [(run.run, run.agent_sha256, run.agent_bytes) for run in made.runs] == [("0", None, None), ("1", None, None)]
+    assert [(run.run, run.agent_sha256, run.agent_bytes) for run in made.runs] == [
+        ("seed0", None, None),
+        ("seed1", None, None),
+    ]
     assert made.config == {"learner": "a table"}
     learn(made.curriculum, 1, tmp_path / "again")
     assert log_sum(RunLog.read(tmp_path / "again" / "run.jsonl")) == made.runs[1].log_sha256
@@ -348,7 +351,7 @@ def test_a_run_with_experts_is_submitted_without_their_logs(
     (run,) = made.runs
     stored = json.loads(Path("runs/one/metrics.json").read_text())
     assert scores_of(made, run)["average_performance"] == stored["average_performance"]["value"]
-    assert [path.name for path in Path("made/logs").iterdir()] == ["one.jsonl.gz"]
+    assert [path.name for path in Path("made/logs").iterdir()] == ["seed0.jsonl.gz"]
     assert [check.text for check in rescore(made) if not check.passed] == []
     log = made.log(run)
     assert len(log.of_kind("experts")[0]["experts"]) == 4

@@ -90,7 +90,7 @@ def test_an_honest_submission_is_rerun_and_a_second_call_repeats_no_run(
     code, written = call(monkeypatch, tiny_home, folder, "--number=3", "--yes")
 
     assert (code, written["level"], written["number"], written["bits"]) == (0, "rerun", 3, True)
-    assert sorted(written["cells"]) == ["tiny-seed0", "tiny-seed1"]
+    assert sorted(written["cells"]) == ["seed0", "seed1"]
     assert len(in_process) == 2
     assert in_process[0].parents[1].stat().st_mode & 0o777 == 0o700, "other users could run what others' code made"
     said = capsys.readouterr()
@@ -329,9 +329,7 @@ def test_a_run_that_cannot_be_finished_here_is_undecided_and_says_why(tiny_submi
     (check,) = rerun.checks_of(run, tiny_submission.log(run), stopped)
 
     assert check.passed is None
-    assert "undecided: tiny-seed0: rerun: expected it finishes, found stopped" in verify.report(
-        tiny_submission, [check]
-    )
+    assert "undecided: seed0: rerun: expected it finishes, found stopped" in verify.report(tiny_submission, [check])
     failed_there = replace(run, reason="the loss was nan")
     assert rerun.checks_of(failed_there, RunLog(), stopped)[0].passed is None
     assert rerun.checks_of(failed_there, RunLog(), stopped._replace(failed_alone=True))[0].passed is True
@@ -371,18 +369,16 @@ def test_limits_out_of_range_are_refused_by_the_names_of_their_options(tmp_path,
     assert said in capsys.readouterr().err
 
 
-def test_what_our_modules_import_is_the_code_of_others(tiny_submission):
-    def said(target):
-        config = {**tiny_submission.config, "method": {"_target_": target}}
+def test_all_code_that_runs_is_named(tiny_submission):
+    def said(config):
         return verify.code_in_words(replace(tiny_submission, config=config))
 
-    assert (
-        verify.code_in_words(tiny_submission)
-        == said("curricula.ct8")
-        == "of this package, as the configuration names it"
-    )
-    for target in ("ctgraph_rl.disk.os.system", "baselines.ppo.torch.load", "baselines.nothing"):
-        assert target in said(target)
+    agent = tiny_submission.config["agent"]["_target_"]
+    for target in ("ctgraph_rl.disk.os.system", "baselines.nothing", "theirs.Method"):
+        got = said({**tiny_submission.config, "method": {"_target_": target}})
+        assert f"{agent}, " in got and f"{target} of https" in got
+    found = said({"agent": {"_target_": "hydra.utils.get_method", "path": "os.system"}})
+    assert found.startswith("os.system of ")
 
 
 def test_limits_follow_from_what_the_submitted_run_took(tiny_submission, tmp_path):
