@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 from ctgraph_rl.board.isolate import Isolation, Limits, Outcome, home, run_isolated
 from ctgraph_rl.board.relearn import Relearning, run_dir_of
-from ctgraph_rl.board.rescore import NO_ROW, Check, differing, equal
+from ctgraph_rl.board.rescore import Check, equal
 from ctgraph_rl.board.submission import Submission, SubmittedRun, counted_lines, log_sum
 from ctgraph_rl.board.two_samples import compare_samples
 from ctgraph_rl.checks import ReadOnlyValues, require
@@ -220,9 +220,9 @@ def checks_of(run: SubmittedRun, submitted: RunLog, result: Rerun, other_bits: S
 
 def first_difference(submitted: RunLog, found: RunLog) -> str:
     """Return in words the first measurement in which two logs differ, if any."""
-    lines = zip_longest(counted_lines(submitted), counted_lines(found), fillvalue=NO_ROW)
+    lines = zip_longest(counted_lines(submitted), counted_lines(found), fillvalue={})
     for number, (one, other) in enumerate(lines, 1):
-        keys = differing(one, other)
+        keys = [key for key in {**one, **other} if one.get(key) != other.get(key)]
         if keys:
             values = ", ".join(f"{key} {one.get(key)!r:.60} and {other.get(key)!r:.60}" for key in keys[:3])
             return terminal_text(f"first in line {number}, {one.get('kind', other.get('kind'))}: {values}")

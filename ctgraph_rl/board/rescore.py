@@ -29,8 +29,6 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 
 RESCORED = LEVELS[0]
 
-NO_ROW: ReadOnlyValues = {}
-
 OF_OURS = "baselines."
 
 MAY_BE_READ = ("", "the frames of each block")
@@ -54,11 +52,6 @@ class Check(NamedTuple):
         where = f"{self.run}: " if self.run else ""
         note = f" ({self.note})" if self.note else ""
         return f"{where}{self.what}: expected {self.expected}, found {self.found}{note}"
-
-
-def differing(one: ReadOnlyValues, other: ReadOnlyValues) -> list[str]:
-    """Return the names whose values differ between two mappings; None stands for none."""
-    return [name for name in {**one, **other} if one.get(name) != other.get(name)]
 
 
 def equal(what: str, expected: object, found: object, run: str = "") -> Check:

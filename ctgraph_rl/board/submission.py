@@ -146,11 +146,10 @@ class Submission:
         return read_log(self.path / log_name(run.run))
 
 
-def read_submission(path: Path | str, of_track: Track | None = None, config_dir: Path | None = None) -> Submission:
+def read_submission(path: Path | str, config_dir: Path | None = None) -> Submission:
     """Read a submission and check its form; `ctgraph_rl.board.rescore` checks its content.
 
     Args:
-        of_track: in place of the track that its method names.
         config_dir: where the user's tracks are, as ``track/NAME.yaml``.
 
     Raises:
@@ -176,8 +175,8 @@ def read_submission(path: Path | str, of_track: Track | None = None, config_dir:
         )
         method = {**content["method"], "failed": {run.seed: run.reason for run in runs if not run.finished}}
         check_method(method)
-        if of_track is None and method["track"] is not None:
-            of_track = track(method["track"], config_dir)
+        name = method["track"]
+        of_track = None if name is None else track(name, config_dir)
         curriculum = _curriculum(content["curriculum"], of_track)
     absent = [log_name(run.run) for run in runs if not (path / log_name(run.run)).is_file()]
     require((not absent, f"{path} lacks {listed(absent)}, which {SUBMISSION} names"))

@@ -79,7 +79,7 @@ def submit(
         config.pop("seed", None)
         content = submission_text(about, config, runs[0].about["versions"], curriculum, tuple(lines))
         write_whole(folder / SUBMISSION, content)
-        made = read_submission(folder, of_track)
+        made = read_submission(folder, None if of_track is None else of_track.config_dir)
     return replace(made, path=to)
 
 

@@ -93,7 +93,7 @@ def tiny_submission(tiny_home: Path, tiny_track: Track, method: dict[str, Any]) 
 def submission(tiny_submission: Submission, tmp_path: Path) -> Iterator[Submission]:
     """A valid submission that a test may change."""
     folder = shutil.copytree(tiny_submission.path, tmp_path / "submission")
-    yield read_submission(folder, tiny_submission.track)
+    yield read_submission(folder, tiny_submission.track.config_dir)
 
 
 CLOSED = Isolation(bubblewrap="0.8.0", why_not=None, memory=CGROUP, graphics=False)

@@ -26,7 +26,7 @@ from ctgraph_rl.board.submission import Submission, log_name, log_sum, packed, r
 
 def checked(given: Submission) -> None:
     """Do what a verifier does who runs no code."""
-    read = read_submission(given.path, given.track)
+    read = read_submission(given.path, given.track.config_dir)
     wrong = [check.text for check in rescore(read) if not check.passed]
     if wrong:
         raise ValueError("; ".join(wrong))

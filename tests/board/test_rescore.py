@@ -38,7 +38,7 @@ def better(lines: list[dict]) -> None:
 
 def found(submission: Submission) -> dict[str, str]:
     """What a verification of the files as they are now finds wrong, each with its run and note."""
-    checks = rescore(read_submission(submission.path, submission.track))
+    checks = rescore(read_submission(submission.path, submission.track.config_dir))
     return {
         check.what: f"{check.run}: {check.expected}; {check.found}; {check.note}"
         for check in checks
@@ -63,7 +63,7 @@ def test_the_scores_are_those_of_the_log(submission):
     before = scores_of(submission, run)
 
     edit_log(submission.path, better, with_sum=True)
-    edited = read_submission(submission.path, submission.track)
+    edited = read_submission(submission.path, submission.track.config_dir)
 
     assert (before["average_performance"], scores_of(edited, edited.runs[1])["average_performance"]) == (0.0, 0.25)
 

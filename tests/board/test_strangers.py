@@ -88,7 +88,7 @@ def test_a_broken_submission_is_refused_in_one_line(tiny_submission, copy, name)
     breaks(copy)
 
     with pytest.raises(ValueError) as refused:
-        broken = read_submission(copy, tiny_submission.track)
+        broken = read_submission(copy, tiny_submission.track.config_dir)
         rescore(broken)
         assert broken.digest
 

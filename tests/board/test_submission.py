@@ -31,10 +31,10 @@ def test_the_page_of_the_format_lists_every_file_and_key():
 def test_the_digest_is_that_of_the_file_that_has_the_sums_of_all_logs(submission):
     (submission.path / "verification.json").write_text("{}")
     (submission.path / "logs" / "code.py").write_text("")
-    assert read_submission(submission.path, submission.track).digest == submission.digest
+    assert read_submission(submission.path, submission.track.config_dir).digest == submission.digest
 
     edit_run(submission.path, log_sha256="0" * 64)
-    assert read_submission(submission.path, submission.track).digest != submission.digest
+    assert read_submission(submission.path, submission.track.config_dir).digest != submission.digest
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def test_what_is_no_submission_is_refused_with_the_file_and_the_key(submission, 
     edit(submission.path, change)
 
     with pytest.raises(ValueError, match=f"submission.json .*{message}"):
-        read_submission(submission.path, submission.track)
+        read_submission(submission.path, submission.track.config_dir)
 
 
 @pytest.mark.parametrize(
@@ -81,17 +81,17 @@ def test_a_run_out_of_range_is_refused(submission, values, message):
     edit_run(submission.path, 1, **values)
 
     with pytest.raises(ValueError, match=f"submission.json .*{message}"):
-        read_submission(submission.path, submission.track)
+        read_submission(submission.path, submission.track.config_dir)
 
 
 def test_without_a_file_it_names_the_file_is_named(submission):
     (submission.path / "logs" / "seed0.jsonl.gz").unlink()
     with pytest.raises(ValueError, match=r"lacks logs/seed0.jsonl.gz, which submission.json names"):
-        read_submission(submission.path, submission.track)
+        read_submission(submission.path, submission.track.config_dir)
 
     (submission.path / SUBMISSION).unlink()
     with pytest.raises(ValueError, match=r"holds no submission, it lacks submission.json: ctgraph-rl submit RUNS --to"):
-        read_submission(submission.path, submission.track)
+        read_submission(submission.path, submission.track.config_dir)
 
 
 def test_no_log_is_unpacked_beyond_its_limit_and_a_torn_one_is_refused(submission, monkeypatch):
@@ -110,7 +110,7 @@ def test_no_log_is_unpacked_beyond_its_limit_and_a_torn_one_is_refused(submissio
     log.unlink()
     log.symlink_to(submission.path / "verification.json")
     with pytest.raises(ValueError, match="lacks logs/seed0"):
-        read_submission(submission.path, submission.track)
+        read_submission(submission.path, submission.track.config_dir)
 
 
 BOMBS = {

@@ -346,7 +346,7 @@ def test_a_run_with_experts_is_submitted_without_their_logs(
     words = ("--config-dir", str(tiny_home / "conf"), "track=tiny", "experts=true", "seed=0", "hydra.run.dir=runs/one")
     assert command_line(monkeypatch, *words, *tiny_settings) == 0
 
-    made = submit([Path("runs")], Path("made"), method, one)
+    made = replace(submit([Path("runs")], Path("made"), method, one), track=one)
 
     (run,) = made.runs
     stored = json.loads(Path("runs/one/metrics.json").read_text())
