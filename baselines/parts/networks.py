@@ -327,12 +327,6 @@ def joined(features: Tensor, *others: Tensor) -> Tensor:
     return torch.cat([features, *others], dim=-1) if others else features
 
 
-def copied_action(keys: Sequence[str]) -> list[TensorDictModule]:
-    """Return the module that copies ``action`` for a trunk that reads the last one, if it does."""
-    copy = TensorDictModule(nn.Identity(), in_keys=["action"], out_keys=[("next", PREVIOUS_ACTION)])
-    return [copy] * (PREVIOUS_ACTION in keys)
-
-
 def sequences_of(batch: Data, keys: Sequence[str], states: Sequence[str] = ()) -> TensorsByName:
     """Return inputs of a batch, [rows, steps, ...] each; only the first step's of ``states`` and unstored keys."""
     return {key: batch[key][:, :1] if key.startswith(UNSTORED) or key in states else batch[key] for key in keys}
@@ -455,13 +449,9 @@ class ActorCritic(TensorDictSequential):
     """Whether it acts without a branch on data, as `ctgraph_rl.learn.collect.CapturedAct` needs."""
 
     def __init__(self, trunk: TensorDictModuleBase, actor: ProbabilisticActor, critic: ValueOperator) -> None:
-        [features] = actor.in_keys
-        copied = copied_action(trunk.in_keys)
-        keys = ["action", "action_log_prob", "state_value", *(key for key in trunk.out_keys if key != features)]
-        for module in copied:
-            keys += module.out_keys
-        super().__init__(trunk, actor, critic, *copied, selected_out_keys=keys)
-        self._parts = trunk, features, actor.module[0].module, critic.module, copied
+        super().__init__(trunk, actor, critic)
+        self.out_keys = ["action", "action_log_prob", "state_value", *state_written(trunk)]
+        self._parts = trunk, trunk.out_keys[0], actor.module[0].module, critic.module
         """What acting needs of the modules; looking it up takes 30 µs."""
 
     def outputs(self, data: Data) -> TensorsByName:
@@ -470,14 +460,14 @@ class ActorCritic(TensorDictSequential):
 
     def one_step(self, data: Data) -> Items:
         """Return `outputs` for one step of all rows, and with memory the next state under ``("next", key)``."""
-        trunk, key, *_ = self._parts
+        trunk, key, _, _ = self._parts
         written = trunk.act(data)
         features = written.pop(key)
         return {**written, **self.heads(features)}
 
     def heads(self, features: Tensor) -> TensorsByName:
         """Return `outputs` from the trunk's features."""
-        _, _, logits, value, _ = self._parts
+        _, _, logits, value = self._parts
         return {"log_probs": log_probabilities(logits(features)), "state_value": value(features)}
 
     def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
@@ -488,27 +478,27 @@ class ActorCritic(TensorDictSequential):
 
     def action_probs(self, data: Data) -> tuple[Tensor, Items]:
         """Return action probabilities and the trunk's next state, as `ctgraph_rl.agent.Agent`."""
-        trunk, key, logits, *_ = self._parts
-        written = trunk.act(data)
-        chances = _normalised(logits(written.pop(key))).softmax(dim=-1)
+        written = self.one_step(data)
+        chances = written.pop("log_probs").softmax(dim=-1)
         return most_likely(chances) if is_greedy() else chances, written
 
     def act_on_tensors(self, data: Data) -> Items:
         """Return what `forward` writes, for `ctgraph_rl.learn.collect.act`."""
-        trunk, key, logits, value, others = self._parts
-        written = trunk.act(data)
-        features = written.pop(key)
-        log_probs = _normalised(logits(features))
+        written = self.one_step(data)
+        log_probs = written.pop("log_probs")
         chances = log_probs.softmax(dim=-1)
         action = chances.argmax(dim=-1) if is_greedy() else draw(chances)
         action = guided(data, action)
         written["action"] = action
         written["action_log_prob"] = log_probs.gather(-1, action.unsqueeze(-1)).squeeze(-1)
-        written["state_value"] = value(features)
-        for module in others:
-            made = module.module(*(written[key] if key in written else data[key] for key in module.in_keys))
-            written |= zip(module.out_keys, made if isinstance(made, tuple) else (made,), strict=True)
+        if PREVIOUS_ACTION in self.in_keys:
+            written["next", PREVIOUS_ACTION] = action
         return written
+
+
+def state_written(trunk: TensorDictModuleBase) -> list[Any]:
+    """Return the keys that a policy on a trunk writes of the next step: the state, and the action if it reads that."""
+    return [*trunk.out_keys[1:], *[("next", PREVIOUS_ACTION)] * (PREVIOUS_ACTION in trunk.in_keys)]
 
 
 def guided(data: Data, action: Tensor) -> Tensor:
@@ -538,11 +528,6 @@ def draw(chances: Tensor) -> Tensor:
 def log_probabilities(logits: Tensor) -> Tensor:
     """Return logarithms of categorical probabilities, [..., n]."""
     return logits - logits.logsumexp(dim=-1, keepdim=True)
-
-
-def _normalised(logits: Tensor) -> Tensor:
-    most = logits.amax(dim=-1, keepdim=True)
-    return logits - (logits - most).exp().sum(dim=-1, keepdim=True).log().add(most)
 
 
 def entropy(log_probs: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.data import Composite, LazyTensorStorage, TensorDictReplayBuffer, TensorSpec
 from torchrl.data.postprocs import MultiStep
@@ -36,6 +36,7 @@ from ctgraph_rl.checks import (
     require_memory,
 )
 from ctgraph_rl.core.device import torchs_defaults
+from ctgraph_rl.learn.collect import PREVIOUS_ACTION
 
 LONGEST_TARGET = 10**4
 
@@ -86,16 +87,15 @@ class EpsilonGreedy(TensorDictSequential):
 
     @override
     def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
-        exploration, *others = self.module[1:]
         values, written = self._act(tensordict)
         written["action"] = values.argmax(dim=-1)
         for key, value in written.items():
             tensordict.set(key, value)
-        exploration(tensordict)
-        tensordict.set("action", guided(tensordict, tensordict["action"]))
-        for module in others:
-            module(tensordict)
-        return tensordict
+        self.module[1](tensordict)
+        action = guided(tensordict, tensordict["action"])
+        if PREVIOUS_ACTION in self.in_keys:
+            tensordict.set(("next", PREVIOUS_ACTION), action)
+        return tensordict.set("action", action)
 
     def action_probs(self, data: Data) -> tuple[Tensor, Items]:
         """Return action probabilities and the trunk's next state, as `ctgraph_rl.agent.Agent`."""
@@ -194,22 +194,18 @@ class QLearner(Learner):
         self,
         greedy: TensorDictModuleBase,
         action_spec: TensorSpec,
-        *state: Any,
-        copied: Sequence[TensorDictModule] = (),
+        state: Sequence[Any] = (),
     ) -> None:
         """Set the acting network, its target network and the exploration.
 
         Args:
             greedy: writes the best ``action``.
-            state: keys of the network's recurrent state.
-            copied: from `copied_action`.
+            state: from `state_written`.
         """
         eps = float(self.settings.eps_init), float(self.settings.eps_end)
         self.exploration = Exploration(action_spec, *eps, self.annealing_batches)
-        keys = ["action", *state]
-        for module in copied:
-            keys += module.out_keys
-        self.policy = EpsilonGreedy(greedy, self.exploration, *copied, selected_out_keys=keys)
+        self.policy = EpsilonGreedy(greedy, self.exploration)
+        self.policy.out_keys = ["action", *state]
         self.greedy = greedy
         self.network_changed()
         self.optimiser = make_optimiser("adam", greedy.parameters(), self.settings.learning_rate)

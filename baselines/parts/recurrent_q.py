@@ -19,7 +19,7 @@ from typing_extensions import override
 
 from baselines.cells.cell import MakeCell, linear_layer
 from baselines.cells.lstm import LSTM
-from baselines.parts.networks import Data, TensorsByName, copied_action, num_actions_of, recurrent, require_weights
+from baselines.parts.networks import Data, TensorsByName, num_actions_of, recurrent, require_weights, state_written
 from baselines.parts.q_learning import QLearner, QLearnerSettings, require_replay
 from ctgraph_rl.checks import require
 from ctgraph_rl.learn.collect import UNSTORED
@@ -77,8 +77,7 @@ class RecurrentQ(QLearner):
         head = Quantiles(width, num_actions, self.num_quantiles)
         values = TensorDictModule(head, in_keys=["memory"], out_keys=["action_value", "quantiles"])
         greedy = QValueActor(TensorDictSequential(self.trunk, values), in_keys=self.trunk.in_keys, spec=action_spec)
-        state = self.trunk.out_keys[1:]
-        self.set_networks(greedy, action_spec, *state, copied=copied_action(self.trunk.in_keys))
+        self.set_networks(greedy, action_spec, state_written(self.trunk))
 
     @override
     def require_room(self, observation_spec: Composite, num_actions: int) -> None:
