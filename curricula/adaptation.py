@@ -69,7 +69,7 @@ def penn_a_swap(
         ),
         (num_lives is None or num_frames is None, "num_frames is of one life: leave it out with num_lives"),
     )
-    task = lab_task("0" * depth, (2, 2), (3, 3), (4, 4), fail_reward=-0.4, unique_decisions=False, unique_waits=False)
+    task = lab_task("0" * depth, Observations((2, 2), (3, 3), (4, 4)), fail_reward=-0.4)
     episode = _longest_episode(depth) * num_rows
     evaluation = None
     if num_lives is None:

@@ -16,7 +16,6 @@ from ctgraph_rl.core.goal import Goal, read_goal
 from ctgraph_rl.core.rewards import REWARD_FNS
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import OneHot
-from ctgraph_rl.tasks.observations import Observations
 from ctgraph_rl.tasks.paper_json import shown_ids
 from ctgraph_rl.tasks.protocol import Evaluation, count_rule
 from ctgraph_rl.tasks.reference import read_task
@@ -147,15 +146,15 @@ def from_axes(
         require(((goals, order) == ("all", "product"), drawn))
         factors = several(branching_factor, task.graph.branching_factor)
         graphs = axes.random_tasks(random_graphs, seed, factors, depths, probs, kinds=(kind,), image_seeds=seeds)
-    ids = {
-        "unique_decisions": unique_decisions,
-        "unique_waits": unique_waits,
-        "decision_ids": decision_ids,
-        "wait_ids": wait_ids,
-    }
     changed = []
     for each in graphs:
-        shown = _shown(each, ids)
+        shown = each.observations
+        if any(given is not None for given in (unique_decisions, unique_waits, decision_ids, wait_ids)):
+            own_decisions = shown.unique_decisions if unique_decisions is None else unique_decisions
+            own_waits = shown.unique_waits if unique_waits is None else unique_waits
+            draws = not (shown.unique_waits or own_waits) and shown.wait_ids[0] < shown.wait_ids[1]
+            waits = shown.wait_ids if wait_ids is None and draws else wait_ids
+            shown = shown_ids(each.graph, own_waits, own_decisions, waits, decision_ids)
         count = shown.last_id + 1 if num_images is None else num_images
         made = replace(
             each,
@@ -252,17 +251,6 @@ def several(value: object, usual: object = None) -> tuple[Any, ...]:
     """Return one or several values as a tuple; None stands for the usual ones."""
     listed = as_tuple(usual if value is None else value)
     return listed if isinstance(listed, tuple) else (listed,)
-
-
-def _shown(task: Task, ids: ReadOnlyValues) -> Observations:
-    shown = task.observations
-    given = {name: value for name, value in ids.items() if value is not None}
-    if not given:
-        return shown
-    draws = not shown.unique_waits and shown.wait_ids[0] < shown.wait_ids[1]
-    kept = {"wait_ids": shown.wait_ids} if draws and not given.get("unique_waits") else {}
-    found = {"unique_decisions": shown.unique_decisions, "unique_waits": shown.unique_waits, **kept, **given}
-    return shown_ids(task.graph, found)
 
 
 def _in_order(by_seed: Sequence[Tasks], goals: Any, num_goals: int, order: str, seed: int) -> Tasks:

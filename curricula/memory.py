@@ -6,13 +6,11 @@ observations. It is unknown whether decisions had their own images: an argument 
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from ctgraph_rl.checks import is_int, is_real, require, true_or_false
 from ctgraph_rl.core.graph import CTGraph
-from ctgraph_rl.tasks.configurations import observations_of
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import PaperImages
+from ctgraph_rl.tasks.observations import Observations
 from ctgraph_rl.tasks.task import Task
 from curricula.axes import sequence
 
@@ -48,6 +46,7 @@ def co_hard(
     """
     require(
         (is_int(depth, 1, MOST_DEPTH), f"depth must be an integer in 1..{MOST_DEPTH}, got {depth!r}"),
+        (is_int(num_wait_images, 1), f"num_wait_images must be an integer >= 1, got {num_wait_images!r}"),
         *true_or_false(unique_decisions=unique_decisions),
     )
     p = wait_prob
@@ -58,20 +57,18 @@ def co_hard(
         waits = (expected_length - least) / (depth + 1)  # E[rho] = 2 (d + 1) + (d + 1) p / (1 - p)
         p = waits / (1 + waits)
     graph = CTGraph(2, depth, p)
-    observations = replace(observations_of(graph, "confounding", num_wait_images), read_noise=read_noise)
-    if unique_decisions:
-        more = graph.num_decision_states - 1
-        shown = observations
-        observations = replace(
-            shown,
-            decision_ids=(shown.decision_ids[0], shown.decision_ids[1] + more),
-            wait_ids=(shown.wait_ids[0] + more, shown.wait_ids[1] + more),
-            end_ids=(shown.end_ids[0] + more, shown.end_ids[1] + more),
-            unique_decisions=True,
-            unique_ends=False,
-        )
+    first_wait = 2 + (graph.num_decision_states if unique_decisions else 1)
+    end = first_wait + num_wait_images
+    observations = Observations(
+        wait_ids=(first_wait, end - 1),
+        decision_ids=(2, first_wait - 1),
+        end_ids=(end, end),
+        unique_decisions=unique_decisions,
+        unique_ends=False,
+        read_noise=read_noise,
+    )
     goal = tuple(1 + place % 2 for place in range(depth))
-    task = Task(graph, goal, observations, PaperImages(observations.last_id + 1, image_seed))
+    task = Task(graph, goal, observations, PaperImages(end + 1, image_seed))
     return sequence("co_hard", [task], num_frames, source=SOURCE)
 
 

@@ -7,13 +7,15 @@ with the images of seed 2. Tasks are as `Task.from_json` reads their files.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.core.graph import CTGraph
+from ctgraph_rl.tasks.configurations import observations_of
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import ReferenceImages, ReferenceOneHot
-from ctgraph_rl.tasks.observations import Ids, Observations
+from ctgraph_rl.tasks.observations import Observations
 from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from ctgraph_rl.tasks.task import Task
 from curricula.axes import Tasks, sequence
@@ -37,33 +39,18 @@ def goal_of(path: str) -> tuple[int, ...]:
 
 
 def lab_task(
-    path: str,
-    wait_ids: Ids,
-    decision_ids: Ids,
-    end_ids: Ids,
-    image_seed: int = 1,
-    fail_reward: float = 0.0,
-    unique_decisions: bool = True,
-    unique_waits: bool = True,
-    one_hot: bool = False,
+    path: str, shown: Observations, image_seed: int = 1, fail_reward: float = 0.0, one_hot: bool = False
 ) -> Task:
-    """A task as the labs' files have them: b=2, p=0, one goal, reward 1, no noise, consecutive ids."""
-    count = end_ids[1] + 1
-    observations = Observations(
-        wait_ids,
-        decision_ids,
-        end_ids,
-        unique_waits=unique_waits,
-        unique_decisions=unique_decisions,
-        reward_cue=True,
-        legacy_index=True,
-        noise_before_rotation=True,
-        cue_wraps=True,
-    )
+    """A task as the labs' files have them: b=2, p=0, one goal, reward 1, no noise.
+
+    Args:
+        shown: the ids.
+    """
+    count = shown.last_id + 1
     return Task(
         CTGraph(2, len(path)),
         goal_of(path),
-        observations,
+        replace(shown, reward_cue=True, legacy_index=True, noise_before_rotation=True, cue_wraps=True),
         ReferenceOneHot(count) if one_hot else ReferenceImages(count, image_seed),
         fail_reward=fail_reward,
         reward_noise="multiplicative",
@@ -73,15 +60,12 @@ def lab_task(
 
 def one_wait_image(path: str, image_seed: int) -> Task:
     """A task of the ``pomdp_wait`` environments: one image for all wait states, one for each other state."""
-    n = 2 ** len(path)
-    return lab_task(path, (2, 2), (3, n + 1), (n + 2, 2 * n + 1), image_seed, unique_waits=False)
+    return lab_task(path, observations_of(CTGraph(2, len(path)), "decisions"), image_seed)
 
 
 def full_mdp(path: str, image_seed: int, fail_reward: float = 0.0, one_hot: bool = False) -> Task:
     """A task of the fully observable environments: an image, or a vector, per state."""
-    n = 2 ** len(path)
-    ids = (2, 2 * n), (2 * n + 1, 3 * n - 1), (3 * n, 4 * n - 1)
-    return lab_task(path, *ids, image_seed, fail_reward, one_hot=one_hot)
+    return lab_task(path, observations_of(CTGraph(2, len(path)), "full"), image_seed, fail_reward, one_hot=one_hot)
 
 
 def words(listing: str) -> NamedTasks:

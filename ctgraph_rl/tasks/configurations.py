@@ -68,10 +68,9 @@ def observations_of(graph: CTGraph, kind: str, num_wait_images: int = 100) -> Ob
         (kind in OBSERVABILITY, f"kinds must be some of {', '.join(OBSERVABILITY)}, got {kind!r}"),
         (is_int(num_wait_images, 1), f"num_wait_images must be an integer >= 1, got {num_wait_images!r}"),
     )
-    found: NamedValues = {"unique_waits": kind == "full", "unique_decisions": kind in ("full", "decisions")}
     if kind == "confounding":
-        found |= {"decision_ids": (2, 2), "wait_ids": (3, 2 + num_wait_images)}
-    return shown_ids(graph, found)
+        return shown_ids(graph, False, False, wait_ids=(3, 2 + num_wait_images), decision_ids=(2, 2))
+    return shown_ids(graph, kind == "full", kind in ("full", "decisions"))
 
 
 def ct_fo_b1(goal: Goal = "1.1", image_seed: int = 1) -> Task:

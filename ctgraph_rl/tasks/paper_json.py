@@ -7,12 +7,11 @@ ends in the end state. Files of the authors' implementation have a section ``ima
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from difflib import get_close_matches
 from typing import Any
 
-from ctgraph_rl.checks import NamedValues, ReadOnlyValues, as_tuple, is_int, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, as_tuple, did_you_mean, is_int, require
 from ctgraph_rl.core.goal import Goal
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.tasks.images import OneHot, PaperImages
@@ -78,12 +77,15 @@ def read_paper_json(source: str, content: ReadOnlyValues, goal: Goal | None) -> 
     )
     found = DEFAULTS | found
     graph = CTGraph(found["branching_factor"], found["depth"], found["wait_prob"])
-    observations = replace(shown_ids(graph, found), **_kept(found, "read_noise", "read_rotation"))
+    shown = shown_ids(
+        graph, found["unique_waits"], found["unique_decisions"], found.get("wait_ids"), found.get("decision_ids")
+    )
+    observations = replace(shown, read_noise=found["read_noise"], read_rotation=found["read_rotation"])
     count = found.get("num_images", observations.last_id + 1)
     one_hot = found["one_hot"]
     require((isinstance(one_hot, bool), f"{source}: image_set.1D must be true or false, got {one_hot!r}"))
     images = OneHot(count) if one_hot else PaperImages(count, found["image_seed"])
-    rewards = _kept(found, "goal_reward", "fail_reward", "reward_std")
+    rewards = {name: found[name] for name in SECTIONS["reward"].values() if name in found}
     return {"graph": graph, "goal": goal, "observations": observations, "images": images, **rewards}
 
 
@@ -93,47 +95,30 @@ def _found(source: str, content: ReadOnlyValues) -> Iterator[tuple[str, Any]]:
         if name == SEED:
             continue
         known = SECTIONS.get(name)
-        require((known is not None, f"{source}: unknown section {written!r}{suggested(name, [*SECTIONS, SEED])}"))
+        require((known is not None, f"{source}: unknown section {written!r}; {did_you_mean(name, [*SECTIONS, SEED])}"))
         require((isinstance(section, Mapping), f"{source}: section {written!r} must be an object, got {section!r}"))
         for key, value in section.items():
             meaning = known.get(key.replace(" ", "_"))  # type: ignore[union-attr]
-            unknown = f"{source}: Table 3 has no {written}.{key}{suggested(key, list(known))}"  # type: ignore[arg-type]
+            unknown = f"{source}: Table 3 has no {written}.{key}; {did_you_mean(key, known)}"  # type: ignore[arg-type]
             require((meaning is not None, unknown))
             yield str(meaning), value
 
 
-def suggested(name: object, known: Sequence[str]) -> str:
-    """Return the end of a message about an unknown name: the nearest known one, or all."""
-    close = get_close_matches(str(name), known, n=1)
-    return f"; did you mean {close[0]!r}?" if close else f"; the choices are {', '.join(known)}"
-
-
-def shown_ids(graph: CTGraph, found: ReadOnlyValues) -> Observations:
-    """Return the ids of wait, decision and end states: given ones, else the next free.
-
-    Args:
-        found: ``unique_waits`` and ``unique_decisions``; optional ``wait_ids`` and ``decision_ids``.
-    """
+def shown_ids(
+    graph: CTGraph, unique_waits: bool, unique_decisions: bool, wait_ids: Any = None, decision_ids: Any = None
+) -> Observations:
+    """Return the ids of wait, decision and end states: given ones, else the next free."""
+    ids = {"wait_ids": wait_ids, "decision_ids": decision_ids}
     sizes = {
-        "wait_ids": graph.num_wait_states if found["unique_waits"] else 1,
-        "decision_ids": graph.num_decision_states if found["unique_decisions"] else 1,
+        "wait_ids": graph.num_wait_states if unique_waits else 1,
+        "decision_ids": graph.num_decision_states if unique_decisions else 1,
+        "end_ids": graph.num_end_states if unique_waits or unique_decisions else 1,
     }
-    order = sizes if found["unique_decisions"] else dict(reversed(sizes.items()))
-    ids = _kept(found, *sizes)
-    for name in order:
-        if name not in ids:
-            first = _next(ids)
+    order = ("wait_ids", "decision_ids") if unique_decisions else ("decision_ids", "wait_ids")
+    for name in (*order, "end_ids"):
+        if ids.get(name) is None:
+            ranges = [as_tuple(each) for each in ids.values()]
+            lasts = [each[-1] for each in ranges if isinstance(each, tuple) and each and is_int(each[-1])]
+            first = max([1, *lasts]) + 1
             ids[name] = (first, first + sizes[name] - 1)
-    ends = graph.num_end_states if found["unique_waits"] or found["unique_decisions"] else 1
-    ids["end_ids"] = (_next(ids), _next(ids) + ends - 1)
-    return Observations(**ids, **_kept(found, "unique_waits", "unique_decisions"))
-
-
-def _next(ids: ReadOnlyValues) -> int:
-    ranges = [as_tuple(each) for each in ids.values()]
-    lasts = [last for each in ranges if isinstance(each, tuple) for last in each[-1:] if is_int(last)]
-    return max([1, *lasts]) + 1
-
-
-def _kept(found: ReadOnlyValues, *names: str) -> NamedValues:
-    return {name: found[name] for name in names if name in found}
+    return Observations(**ids, unique_waits=unique_waits, unique_decisions=unique_decisions)

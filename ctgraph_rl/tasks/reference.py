@@ -10,7 +10,7 @@ from os import PathLike
 from os.path import lexists
 from typing import TYPE_CHECKING
 
-from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule, is_int, is_real, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule, did_you_mean, is_int, is_real, require
 from ctgraph_rl.core.goal import Goal
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import Needle, ReferenceLinear, RewardFn
@@ -20,7 +20,7 @@ from ctgraph_rl.tasks.images import ReferenceImages, ReferenceOneHot
 from ctgraph_rl.tasks.images.image_set import WHITE
 from ctgraph_rl.tasks.images.reference_images import MAX_SEED
 from ctgraph_rl.tasks.observations import MAX_READ_ROTATION, Observations
-from ctgraph_rl.tasks.paper_json import is_paper_json, read_paper_json, suggested
+from ctgraph_rl.tasks.paper_json import is_paper_json, read_paper_json
 
 if TYPE_CHECKING:
     from ctgraph_rl.tasks.task import Task
@@ -114,7 +114,7 @@ def _faults(content: ReadOnlyValues, dialect: str) -> Iterator[str]:
     names = (*_SECTIONS, "general_seed")
     for name in content:
         if name not in names:
-            yield f"unknown section {name!r}{suggested(name, names)}"
+            yield f"unknown section {name!r}; {did_you_mean(name, names)}"
     for name in _SECTIONS:
         if not isinstance(content.get(name), Mapping):
             yield f"section {name!r} {'must be an object' if name in content else 'is missing'}"
@@ -138,7 +138,7 @@ def _surplus(section: str, key: str, dialect: str) -> str:
                 fix = f"use {here[name][1]!r}" if name in here else "leave it out"
                 return f"{section}.{key} is of the {other} dialect, the other keys of the {dialect} one: {fix}"
     keys = [known for home, known in here.values() if home == section]
-    return f"unknown key {section}.{key}{suggested(key, keys)}"
+    return f"unknown key {section}.{key}; {did_you_mean(key, keys)}"
 
 
 def _value_rules(found: NamedValues, places: dict[str, tuple[str, str]]) -> list[Rule]:

@@ -370,7 +370,8 @@ def test_tasks_of_the_task_free_protocol_differ_in_goals_in_inputs_or_in_both():
 def test_a_task_of_a_lab_is_that_of_its_file(unique, one_hot):
     ids = (2, 8), (9, 11), (12, 15)
 
-    task = lab_task("01", *ids, 3, -0.4, unique_decisions=unique[0], unique_waits=unique[1], one_hot=one_hot)
+    shown = Observations(*ids, unique_decisions=unique[0], unique_waits=unique[1])
+    task = lab_task("01", shown, 3, -0.4, one_hot=one_hot)
 
     file = environment(2, *ids, image_seed=3, fail_reward=-0.4, unique=unique, one_hot=one_hot)
     assert task == Task.from_json(file, "1.2")

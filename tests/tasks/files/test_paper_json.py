@@ -79,7 +79,7 @@ def test_decisions_may_be_unique_where_waits_are_not():
     ("change", "message"),
     [
         ({"graph_shape": {"d": 2}}, r"configuration: graph_shape.b is missing"),
-        ({"graph_shape": {"d": 2, "b": 2, "q": 0}}, r"Table 3 has no graph_shape.q; the choices are d, b, p"),
+        ({"graph_shape": {"d": 2, "b": 2, "q": 0}}, r"Table 3 has no graph_shape.q; choices: d, b, p"),
         ({"rewards": {}}, r"unknown section 'rewards'; did you mean 'reward'\?"),
         ({"reward": 1}, r"section 'reward' must be an object, got 1"),
         ({"observations": {"graph_ends": [4, 4]}}, r"Table 3 has no observations.graph_ends"),
