@@ -10,6 +10,7 @@ less than (d + 1) times that.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
@@ -134,7 +135,8 @@ def exact_rules(policy: object, task: TaskLike, start: Step, name: str | None = 
     yield TRIAL not in start, lasts
     if start and all(holds for holds, _ in task_rules(task)):
         count = count_histories(task, PREVIOUS_ACTION in start)  # type: ignore[arg-type]
-        many = f"exact evaluation with memory plays all histories, here {count:.2g}, and at most {MOST_HISTORIES:,}"
+        here = f"{count:.2g}" if math.isfinite(count) else "more than 1e308"
+        many = f"exact evaluation with memory plays all histories, here {here}, and at most {MOST_HISTORIES:,}"
         yield count <= MOST_HISTORIES, f"{many}: {INSTEAD}"
 
 

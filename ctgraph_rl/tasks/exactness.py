@@ -31,17 +31,24 @@ def task_rules(task: TaskLike) -> Iterator[Rule]:
 
 
 def count_histories(task: Task, reads_actions: bool) -> float:
-    """Return how many histories of an episode without failure an agent with memory can have, without long stays."""
+    """Return how many histories of an episode without failure an agent with memory can have, without long stays.
+
+    Infinite above the largest float.
+    """
     graph = task.graph
     x = task.observations
     stays = longest_stay(graph.wait_prob)
     of_waits = 1 if x.is_unique(StateType.WAIT) else x.wait_ids[1] - x.wait_ids[0] + 1
     of_decisions = 1 if x.is_unique(StateType.DECISION) else x.decision_ids[1] - x.decision_ids[0] + 1
     views = num_views(task)
-    waits = sum(math.pow(of_waits * views, length) for length in range(1, stays + 1)) if stays < 100 else math.inf
     first = (x.home_ids[1] - x.home_ids[0] + 1) * views * (graph.branching_factor + 1 if reads_actions else 1)
-    level = waits * of_decisions * views * graph.branching_factor
-    return float(first) * math.pow(level, graph.depth) * waits
+    try:
+        images = of_waits * views
+        waits = stays if images == 1 else (math.pow(images, stays + 1) - images) / (images - 1)
+        level = waits * of_decisions * views * graph.branching_factor
+        return first * math.pow(level, graph.depth) * waits
+    except OverflowError:
+        return math.inf
 
 
 def longest_stay(wait_prob: float) -> int:

@@ -14,6 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 import curricula
 from ctgraph_rl import (
     Block,
+    CTGraph,
     Curriculum,
     Evaluation,
     Gradient,
@@ -260,7 +261,7 @@ def test_a_run_logs_exact_means_of_trained_held_out_and_masked_tasks():
     [
         ("mohqa", {}, "^exact evaluation needs a policy with action_probs, which MOHQA has not: [^;]*$"),
         ("rl2", {}, "needs episodes that do not depend on earlier ones, as those of RL2 do"),
-        ("lstm_ppo", {"graph": replace(ct_su_b1().graph, wait_prob=0.9)}, "plays all histories, here"),
+        ("lstm_ppo", {"graph": replace(ct_su_b1().graph, wait_prob=0.9)}, r"plays all histories, here 7.4e\+07, and"),
     ],
 )
 def test_what_has_no_exact_measures_is_refused_before_training(name, change, reason):
@@ -382,6 +383,20 @@ def test_the_count_of_histories_is_that_of_the_images_drawn():
     assert count_histories(ct_su_b1(), False) == 4
     assert count_histories(ct_su_b1(), True) == 3 * 4
     assert count_histories(few_images(ct_co_b1(), 3), False) == 3**3 * 4
+    assert count_histories(replace(ct_su_b1(), graph=CTGraph(2, 1, 0.9), goal=(1,)), False) == 2 * 264**2
+
+
+@pytest.mark.parametrize("wait_prob", [0.7, 0.9])
+def test_histories_beyond_all_floats_are_endless_and_told_so(wait_prob):
+    task = curricula.load("co_hard").tasks[0]
+    task = replace(task, graph=replace(task.graph, wait_prob=wait_prob))
+    blocks = (Block(task, 8192),)
+    curriculum = Curriculum("own", 1, "none", blocks, evaluation=Evaluation(exact=True))
+
+    assert count_histories(task, False) == math.inf
+    assert "Agents with memory are refused" in str(describe(curriculum))
+    with pytest.raises(ValueError, match="here more than 1e308, and at most"):
+        make_agent("lstm_ppo", curriculum)
 
 
 @pytest.mark.parametrize("name", ["dqn", "qrdqn_lstm"])
