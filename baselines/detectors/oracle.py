@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing_extensions import override
 
-from baselines.detectors.detector import Detector
+from baselines.detectors.detector import Detector, SelfLabelledAgent
 from baselines.detectors.seen import Seen, Verdict
+from ctgraph_rl.agent import Agent
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 
@@ -29,8 +30,9 @@ class Oracle(Detector):
         self.frames = 0
 
     @override
-    def tell(self, curriculum: Curriculum) -> None:
+    def attach(self, agent: Agent, curriculum: Curriculum) -> SelfLabelledAgent:
         self.curriculum = curriculum
+        return super().attach(agent, curriculum)
 
     def present_label(self) -> int:
         """Return the label of the next frame's task; after the end, that of the last one."""

@@ -139,7 +139,7 @@ def _builder(
 
 def _labelled(run_dir: Path, make_method: Callable[[], MethodLike], detector: Any) -> MethodLike:
     method = make_method()
-    if detector is None or hasattr(method, "detector"):
+    if detector is None or hasattr(method, "labelling"):
         return method
     labelled: MethodLike = _ours(run_dir, "detector", detector)().labelling(method)
     return labelled

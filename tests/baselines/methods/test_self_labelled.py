@@ -14,9 +14,8 @@ from helpers.scripted import ONE, TWO, of
 from helpers.small_agents import MINIBATCHES, REPLAY, TINY, batches, made, saved_and_loaded, weights_for
 from helpers.sweeping import command_line
 
-from baselines.detectors.detector import Detector
+from baselines.detectors.detector import Detector, SelfLabelledAgent
 from baselines.detectors.seen import SUSPICION, Seen, Verdict
-from baselines.methods.parts.self_labelled import SelfLabelledAgent
 from baselines.parts.networks import trunk_of
 from baselines.ppo import PPO
 from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, learn_curriculum
