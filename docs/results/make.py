@@ -36,10 +36,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     commands = parser.add_subparsers(metavar="NAME")
     for name in PAGES:
         commands.add_parser(name).set_defaults(run=lambda options, name=name: _make(name))
-    measuring = commands.add_parser("gpu", help="measure a GPU for four minutes, into gpu.json and its page")
-    measuring.add_argument("--minutes", type=float, default=4.0, help="limit of a call; the next call continues")
+    what = "measure a GPU for four minutes, into gpu.json and its page; the next call continues"
+    measuring = commands.add_parser("gpu", help=what)
     measuring.add_argument("--commit", default="", help="what is measured, where the checkout has no .git")
-    measuring.set_defaults(run=lambda options: import_module("studies.gpu").measure(options.minutes, options.commit))
+    measuring.set_defaults(run=lambda options: import_module("studies.gpu").measure(options.commit))
     options = parser.parse_args(arguments)
     try:
         options.run(options)

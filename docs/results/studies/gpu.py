@@ -3,7 +3,7 @@
 It runs the tests marked ``cuda`` and the ladders of learning and of the environment, the most important rungs first,
 and writes gpu.json after each. A call at the same commit on the same kind of GPU measures what earlier ones left.
 Last comes the section on GPUs of docs/reference/speed_table.md. Commit both.
-Where there is no GPU, it writes the section alone, from the gpu.json that is there.
+Where there is no GPU, it writes the section alone.
 """
 
 from __future__ import annotations
@@ -42,32 +42,32 @@ TOGETHER = (64, 1024)
 SECONDS = 1.0
 """The least time of a measurement."""
 
-SHARE = 0.75
-"""Of the minutes of a call; no measurement begins after it, so that the last one ends in time."""
+SECONDS_OF_A_CALL = 180.0
+"""No measurement begins after them, so that the last one ends within four minutes."""
 
 
-def measure(minutes: float, commit: str) -> None:
+def measure(commit: str) -> None:
     """Measure, and write the file and the page; see `parts`."""
-    found = json.loads(FILE.read_text()) if FILE.exists() else None
+    found = json.loads(FILE.read_text())
     if torch.cuda.is_available():
-        before = found or {}
-        found = {}
-        for name, part in parts(torch.device("cuda"), minutes, commit or present_commit(), before):
-            found[name] = part
-            FILE.write_text(json.dumps(found, indent=1) + "\n")
+        measured = {}
+        for name, part in parts(torch.device("cuda"), SECONDS_OF_A_CALL, commit or present_commit(), found):
+            measured[name] = part
+            FILE.write_text(json.dumps(measured, indent=1) + "\n")
+        found = measured
     PAGE.write_text(with_section(PAGE.read_text(encoding="utf-8"), found), encoding="utf-8")
 
 
-def parts(device: torch.device, minutes: float, commit: str, before: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+def parts(device: torch.device, seconds: float, commit: str, before: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     """Yield the parts of the report by name, each again after every measurement; the most important first.
 
     Args:
         device: what is measured.
-        minutes: limit of a call.
+        seconds: no measurement begins after them.
         commit: what is measured.
         before: the report of an earlier call, which is continued if it is of the same commit and device.
     """
-    end = time.perf_counter() + SHARE * 60 * minutes
+    end = time.perf_counter() + seconds
     about = {"device": ladder.machine(device), "driver": said("nvidia-smi", *DRIVER), "versions": versions()}
     known = before if before.get("commit") == commit and before.get("machine") == about else {}
     yield "machine", about
@@ -135,15 +135,13 @@ def tested(limit: float) -> dict[str, Any]:
     return {"exit_code": run.returncode, "said": lines[-1], "failed": [x for x in lines if x.startswith("FAILED")]}
 
 
-def with_section(page: str, report: Mapping[str, Any] | None) -> str:
+def with_section(page: str, report: Mapping[str, Any]) -> str:
     """Return the page with the section of a report."""
     return SECTION.sub(lambda _: section(report), page)
 
 
-def section(report: Mapping[str, Any] | None) -> str:
-    """Return what the page says of a report; None: that nothing was measured."""
-    if report is None:
-        return "Not measured: no GPU was at hand.\n"
+def section(report: Mapping[str, Any]) -> str:
+    """Return what the page says of a report."""
     about, tests = report["machine"], report.get("tests", {"said": "not run"})
     text = f"Measured on {about['device']}, driver {about['driver']}, commit {report['commit']}.\n"
     text += f"Tests marked `cuda`: {tests['said']}.\n"
