@@ -12,11 +12,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ctgraph_rl.board.rerun import Rerun, RerunCell, check_of_scores, job_of, score_name, score_of
+from ctgraph_rl.board.rerun import Rerun, RerunCell, check_of_scores, job_of, score_name
 from ctgraph_rl.board.rescore import Check, of_the_protocol
 from ctgraph_rl.board.submission import Submission
 from ctgraph_rl.board.tracks import HELD_OUT_SEEDS, drawn, held_out_seeds
 from ctgraph_rl.log.escape import terminal_text
+from ctgraph_rl.log.scores import scores
 from ctgraph_rl.parsers import LEVELS
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.task_like import TaskLike
@@ -55,18 +56,15 @@ def held_out_checks(submission: Submission, results: Sequence[tuple[RerunCell, R
     for cell, result in results:
         seed = cell.job.seeds[0]
         failure = result.failure
-        value = None
         try:
             if result.log is not None:
-                value = score_of(result.log, cell.curriculum, name)
+                found.append(scores(result.log, cell.curriculum)[name].value)
                 for check in of_the_protocol(cell.curriculum, seed, result.log, f"seed {seed}"):
                     yield check._replace(level=HELD_OUT)
         except ValueError as error:
             failure = str(error)
         if failure is not None:
             yield Check(f"run of seed {seed}", "it finishes", terminal_text(failure), None, level=HELD_OUT)
-        if value is not None:
-            found.append(value)
     what = f"{name} of {len(found)} runs with other seeds, images and goals"
     yield check_of_scores(submission, found, what, HELD_OUT)
 

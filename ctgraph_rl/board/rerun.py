@@ -234,27 +234,16 @@ def score_name(submission: Submission) -> str:
     return SCORE if submission.track is None else submission.track.score
 
 
-def score_of(log: RunLog, curriculum: Curriculum, name: str) -> float | None:
-    """Return a metric of a log, if it has a value; ValueError for the log of another curriculum."""
-    return scores(log, curriculum)[name].value
-
-
-def submitted_scores(submission: Submission) -> list[float]:
-    """Return the compared metric of each submitted run with a value."""
-    name = score_name(submission)
-    found = []
-    for run in submission.finished:
-        value = score_of(submission.log(run), submission.curriculum, name)
-        if value is not None:
-            found.append(value)
-    return found
-
-
-def check_of_scores(submission: Submission, found: Sequence[float], what: str, level: str, note: str = "") -> Check:
+def check_of_scores(
+    submission: Submission, values: Sequence[float | None], what: str, level: str, note: str = ""
+) -> Check:
     """Test whether scores are lower than the submitted ones, and say what the test could find."""
-    submitted = submitted_scores(submission)
+    name = score_name(submission)
+    there = [scores(submission.log(run), submission.curriculum)[name].value for run in submission.finished]
+    submitted = [value for value in there if value is not None]
+    found = [value for value in values if value is not None]
     if not submitted or not found:
-        why = f"{len(submitted)} submitted runs and {len(found)} others have a value of {score_name(submission)}"
+        why = f"{len(submitted)} submitted runs and {len(found)} others have a value of {name}"
         return Check(what, "scores of both", why, None, level=level, note=note)
     difference = compare_samples(submitted, found)
     passed = False if difference.is_lower else None if difference.is_blind else True
@@ -274,11 +263,10 @@ def verified(submission: Submission, results: Mapping[SubmittedRun, Rerun], othe
         of_run = checks_of(run, submission.log(run), result, other_bits)
         wrong = any(check.passed is False and check.what != BYTES for check in of_run)
         if wrong and other_bits and result.log is not None:
-            scored.append(score_of(result.log, submission.curriculum, name))
+            scored.append(scores(result.log, submission.curriculum)[name].value)
             of_run = [check for check in of_run if check.what == BYTES]
         checks += of_run
     if not scored:
         return checks
     note = f"bits differ, as they may with {'; '.join(other_bits)}"
-    values = [value for value in scored if value is not None]
-    return [check_of_scores(submission, values, f"{name} of {len(scored)} reruns", RERUN, note), *checks]
+    return [check_of_scores(submission, scored, f"{name} of {len(scored)} reruns", RERUN, note), *checks]

@@ -7,6 +7,7 @@ import math
 import shutil
 import signal
 import sys
+from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -204,15 +205,15 @@ def test_seeds_that_were_trained_together_are_drawn_as_their_group(tiny_submissi
 def test_where_bits_are_not_promised_scores_are_tested_and_the_power_is_stated(
     tiny_submission, monkeypatch, found, passed
 ):
-    monkeypatch.setattr(rerun, "submitted_scores", lambda submission: [0.8, 0.85, 0.9, 0.8, 0.95])
-    scores = iter(found)
-    monkeypatch.setattr(rerun, "score_of", lambda *_: next(scores))
+    values = iter([*found, 0.8, 0.85, 0.9, 0.8, 0.95])
+    monkeypatch.setattr(rerun, "scores", lambda *_: defaultdict(lambda: SimpleNamespace(value=next(values))))
     run = tiny_submission.runs[0]
+    submission = replace(tiny_submission, runs=(run,) * 5)
     other = rerun.Rerun(RunLog(), "", None, run.agent_bytes)
     results = {replace(run, seed=seed): other for seed in range(1, len(found) + 1)}
     stopped = rerun.Rerun(None, None, "stopped: it took longer than 1 seconds")
 
-    check, *sizes, undecided = rerun.verified(tiny_submission, {**results, run: stopped}, ["cpu A there, B here"])
+    check, *sizes, undecided = rerun.verified(submission, {**results, run: stopped}, ["cpu A there, B here"])
 
     assert check.passed is passed
     assert ({size.what for size in sizes}, all(size.passed for size in sizes)) == ({rerun.BYTES}, True)
