@@ -20,7 +20,7 @@ from typing import Any
 
 import yaml
 
-from ctgraph_rl.checks import NamedValues, ReadOnlyValues, as_path, is_shallow, repeated, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, as_path, did_you_mean, is_shallow, repeated, require
 from ctgraph_rl.disk import in_words, read_regular
 
 MAX_NESTING = 32
@@ -101,6 +101,23 @@ def json_object(
         raise ValueError(f"{path_or_dict} must be JSON: {error}") from error
     require((isinstance(content, dict), f"{path_or_dict} must hold a JSON object, got {type(content).__name__}"))
     return str(path_or_dict), content
+
+
+def require_keys(content: Any, names: Sequence[str], optional: Sequence[str] = ()) -> None:
+    """Refuse what is no object, and one that lacks a name or has a name beside the optional ones.
+
+    Raises:
+        ValueError: names the keys, with the likely one for the first that is unknown.
+    """
+    require((isinstance(content, Mapping), f"must be an object with {', '.join(names)}, got {content!r:.80}"))
+    known = (*names, *optional)
+    missing = [name for name in names if name not in content]
+    unknown = [str(name)[:80] for name in content if name not in known]
+    hint = f"; {did_you_mean(unknown[0], known)}" if unknown else ""
+    require(
+        (not missing, f"missing keys: {', '.join(missing)}"),
+        (not unknown, f"unknown keys: {', '.join(unknown)[:200]}{hint}"),
+    )
 
 
 @cache

@@ -11,14 +11,13 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from difflib import get_close_matches
 from itertools import accumulate
 from os import PathLike
 from pathlib import Path
 from reprlib import repr as short
 
-from ctgraph_rl.checks import ReadOnlyValues, Rule, are_ints, is_int, require, takes_numbers
-from ctgraph_rl.strict import json_object, within
+from ctgraph_rl.checks import ReadOnlyValues, Rule, are_ints, is_int, one_of, require, takes_numbers, true_or_false
+from ctgraph_rl.strict import json_object, require_keys, within
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import MOST_TASKS, Protocol
 from ctgraph_rl.tasks.reference import read_task
@@ -56,7 +55,7 @@ def from_meta_json(path: str | PathLike[str], num_frames: int | Sequence[int], n
     file = Path(path)
     meta = _read(file)
     with within(file):
-        require(*_key_rules(meta))
+        require_keys(meta, REQUIRED, OPTIONAL)
         require(*_value_rules(meta))
         paths = [_within(file.parent, config) for config in meta["config_paths"]]
     environments = []
@@ -130,17 +129,6 @@ def _within(folder: Path, name: str) -> Path:
     return path
 
 
-def _key_rules(meta: ReadOnlyValues) -> list[Rule]:
-    known = (*REQUIRED, *OPTIONAL)
-    unknown = [key for key in meta if key not in known]
-    near = [f"; did you mean {match!r}?" for key in unknown for match in get_close_matches(key, known, 1)]
-    missing = [key for key in REQUIRED if key not in meta]
-    return [
-        (not unknown, f"unknown key {short(unknown)}{''.join(near)} The keys are {', '.join(known)}"),
-        (not missing, f"missing key {', '.join(missing)}"),
-    ]
-
-
 def _value_rules(meta: ReadOnlyValues) -> list[Rule]:
     paths = meta["config_paths"]
     order = meta["task_order"]
@@ -158,9 +146,9 @@ def _value_rules(meta: ReadOnlyValues) -> list[Rule]:
         _int_rule("num_tasks", meta.get("num_tasks", 1)),
         _ints_rule("filter_tasks", meta.get("filter_tasks", [0])),
         _ints_rule("task_label_ids", meta.get("task_label_ids", [0])),
-        (mode in LABEL_MODES, f"task_label_mode must be one of {', '.join(LABEL_MODES)}, got {short(mode)}"),
+        *one_of(LABEL_MODES, task_label_mode=mode),
         (mode != "explicit" or "task_label_ids" in meta, "task_label_mode explicit needs task_label_ids"),
-        (isinstance(by_place, bool), f"label_by_curriculum_index must be true or false, got {short(by_place)}"),
+        *true_or_false(label_by_curriculum_index=by_place),
     ]
 
 

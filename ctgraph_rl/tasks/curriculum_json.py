@@ -14,7 +14,6 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
-from difflib import get_close_matches
 from itertools import chain
 from os import PathLike
 from os.path import lexists
@@ -26,7 +25,7 @@ from ctgraph_rl.core.goal import write_goal
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import REWARD_FNS
 from ctgraph_rl.disk import write_whole
-from ctgraph_rl.strict import json_object, within
+from ctgraph_rl.strict import json_object, require_keys, within
 from ctgraph_rl.tasks.images import IMAGE_SETS
 from ctgraph_rl.tasks.kinds.frozen_arguments import DictArgument, TupleArgument, from_json
 from ctgraph_rl.tasks.kinds.gym_task import GymTask, require_wrapper_classes
@@ -132,7 +131,7 @@ def read_curriculum(
         schema = content.get("schema")
         newer = f"schema {schema} is newer than {SCHEMA}, the newest that is known here; update ctgraph_rl"
         require((not is_int(schema, SCHEMA + 1), newer))
-        _check_keys(content, _KEYS)
+        require_keys(content, _KEYS)
         require((schema == SCHEMA, f"schema must be {SCHEMA}, got {schema!r}"))
         require((isinstance(content["source"], str), f"source must be a text, got {content['source']!r:.80}"))
         listed = content["tasks"]
@@ -209,19 +208,6 @@ def _check_form(value: Any, nesting: int = 1) -> None:
     )
 
 
-def _check_keys(content: Any, names: Sequence[str], optional: Sequence[str] = ()) -> None:
-    require((isinstance(content, Mapping), f"must be an object with {', '.join(names)}, got {content!r:.80}"))
-    missing = [name for name in names if name not in content]
-    known = {*names, *optional}
-    unknown = [str(name) for name in content if name not in known]
-    close = get_close_matches(unknown[0][:80], names, 1) if unknown else []
-    hint = f" (did you mean {close[0]!r}?)" if close else ""
-    require(
-        (not missing, f"missing keys: {', '.join(missing)}"),
-        (not unknown, f"unknown keys: {', '.join(unknown)[:200]}{hint}"),
-    )
-
-
 def _task(content: Any) -> TaskLike:
     if not isinstance(content, Mapping) or "type" not in content:
         task = _built(Task, content)
@@ -262,7 +248,7 @@ def _each(name: str, content: Any, read: Callable[[Any], Any]) -> list[Any]:
 
 def _built(kind: type, content: Any, tasks: Sequence[TaskLike] = ()) -> Any:
     added = [field.name for field in fields(kind) if field.metadata.get("added")]
-    _check_keys(content, [name for name in _names(kind) if name not in added], added)
+    require_keys(content, [name for name in _names(kind) if name not in added], added)
     arguments = {}
     for name, item in content.items():
         with within(name):

@@ -201,7 +201,7 @@ def test_few_tasks_of_a_pool_beyond_counting_are_read_at_once(tmp_path):
         ({"config_paths": [1]}, r"config_paths must be a list of 1 to 1000 paths, got \[1\]"),
         (
             {"filter_task": [0]},
-            r"unknown key \['filter_task'\]; did you mean 'filter_tasks'\? The keys are config_paths",
+            r"unknown keys: filter_task; did you mean 'filter_tasks'\?",
         ),
         ({"task_label_mode": "own"}, r"task_label_mode must be one of global_task_id, .*, got 'own'"),
         ({"task_label_mode": "explicit"}, "task_label_mode explicit needs task_label_ids"),
@@ -228,7 +228,7 @@ def test_a_missing_key_is_named(tmp_path, key):
     content = meta("s1d2")
     del content[key]
 
-    with pytest.raises(ValueError, match=rf"mine.json: missing key {key}"):
+    with pytest.raises(ValueError, match=rf"mine.json: missing keys: {key}"):
         curricula.from_meta_json(write(tmp_path, content), 512)
 
 
