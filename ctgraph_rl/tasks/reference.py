@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping
+from dataclasses import fields
 from itertools import product
 from os import PathLike
 from os.path import lexists
@@ -215,43 +216,31 @@ def write_task(task: Task, path: str | PathLike[str] | None, general_seed: int) 
     require(
         (path is None or not lexists(path), f"{path} exists: choose another path, nothing is overwritten"),
         (is_int(general_seed, 0, MAX_SEED), f"general_seed must be in [0, 2**32), got {general_seed!r}"),
-        *((holds, f"the file cannot express {what}") for holds, what in _expressible(task)),
     )
     values = _values(task)
     content: NamedValues = {"general_seed": general_seed, **{section: {} for section in _SECTIONS}}
     for name, (section, key) in _places("2023").items():
         content[section][key] = values[name]
+    x = task.observations
+    without_effect = {
+        "observations": True,  # their fields are compared
+        "reward_noise": task.reward_std == 0,
+        "legacy_goal_change": task.goal_change is None,
+        "legacy_index": not (x.unique_waits or x.unique_decisions or x.unique_ends),
+        "noise_before_rotation": not (x.read_noise and x.read_rotation),
+    }
+    rules = []
+    read = type(task)(**read_task(content, task.goal))
+    for ours, theirs in ((task, read), (x, read.observations)):
+        for each in fields(ours):
+            own = getattr(ours, each.name)
+            other = getattr(theirs, each.name)
+            same = own == other or without_effect.get(each.name, False)
+            rules.append((same, f"the file cannot express {each.name}={own!r}: use {other!r}"))
+    require(*rules)
     if path is not None:
         write_whole(path, json.dumps(content, indent=2) + "\n")
     return content
-
-
-def _expressible(task: Task) -> list[Rule]:
-    x = task.observations
-    images = task.images
-    unique = x.unique_waits or x.unique_decisions or x.unique_ends
-    kinds = (ReferenceImages, ReferenceOneHot)
-    one_noise = not isinstance(images, ReferenceImages) or x.read_noise == math.floor(images.noise)
-    scales = task.reward_std == 0 or task.reward_noise == "multiplicative"
-    as_others = x.unique_ends == (x.unique_waits or x.unique_decisions)
-    in_order = x.noise_before_rotation or not (x.read_noise and x.read_rotation)
-    return [
-        (isinstance(images, kinds), f"images={images!r}: use ReferenceImages or ReferenceOneHot"),
-        (one_noise, f"read_noise={x.read_noise} with {images!r}: use one noise, noise={x.read_noise} of the images"),
-        (task.reward_fn in _DISTRIBUTIONS.values(), f"reward_fn={task.reward_fn!r}: use Needle or ReferenceLinear"),
-        (task.step_reward == 0, f"step_reward={task.step_reward}: use 0"),
-        (scales, f"reward_noise={task.reward_noise!r}: use 'multiplicative'"),
-        (task.swapped_branches is None, f"swapped_branches={task.swapped_branches}: use None"),
-        (task.extra_end_step, "extra_end_step=False: use True"),
-        (task.goal_change is None or task.legacy_goal_change, "legacy_goal_change=False with a goal_change: use True"),
-        (x.home_ids == (0, 0), f"home_ids={x.home_ids}: use (0, 0)"),
-        (x.fail_ids == (1, 1), f"fail_ids={x.fail_ids}: use (1, 1)"),
-        (as_others, f"unique_ends={x.unique_ends}: end states are unique when waits or decisions are; use None"),
-        (x.reward_cue, "reward_cue=False: use True"),
-        (x.cue_wraps, "cue_wraps=False: use True"),
-        (x.legacy_index or not unique, "legacy_index=False with unique ids: use True"),
-        (in_order, "noise_before_rotation=False with noise and rotation: use True"),
-    ]
 
 
 def _values(task: Task) -> NamedValues:
@@ -267,7 +256,7 @@ def _values(task: Task) -> NamedValues:
         "reward_std": task.reward_std,
         "min_episodes": first,
         "max_episodes": last + 1,
-        "distribution": next(name for name, reward_fn in _DISTRIBUTIONS.items() if reward_fn == task.reward_fn),
+        "distribution": "linear" if task.reward_fn == ReferenceLinear() else "needle_in_haystack",
         "unique_decisions": x.unique_decisions,
         "unique_waits": x.unique_waits,
         "wait_ids": list(x.wait_ids),
