@@ -11,7 +11,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from fractions import Fraction
 from functools import cached_property
-from html import escape
 from itertools import accumulate
 from os import PathLike
 from typing import Any
@@ -33,8 +32,6 @@ from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol, count_rule
 from ctgraph_rl.tasks.task import Task, are_graphs
 
 FINGERPRINT_SCHEMA = 1
-
-SHOWN = 20
 
 
 @dataclass(frozen=True)
@@ -108,24 +105,8 @@ class Curriculum:
                 require(*task_rules(task))
 
     def __repr__(self) -> str:
-        return f"<Curriculum {self._summary}>"
-
-    def _repr_html_(self) -> str:
-        rows = ["<tr><th>block</th><th>tasks</th><th>b, d, p</th><th>frames</th></tr>"]
-        for number, block in enumerate(self.blocks[:SHOWN], 1):
-            names = [self.labels[task] for task in self.trained[number - 1]]
-            graphs = dict.fromkeys(task.graph for task in block.tasks if isinstance(task, Task))
-            shapes = [f"{graph.branching_factor}, {graph.depth}, {graph.wait_prob:g}" for graph in graphs]
-            cells = (str(number), _some(names), _some(shapes, "; "), f"{block.num_frames:,}")
-            rows.append(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in cells)}</tr>")
-        more = f"<p>and {len(self.blocks) - SHOWN:,} more blocks</p>" if len(self.blocks) > SHOWN else ""
-        source = escape(f"{self._summary}. {self.source}")
-        return f"<p>{source}</p><table>{''.join(rows)}</table>{more}"
-
-    @property
-    def _summary(self) -> str:
         sizes = f"tasks: {len(self.tasks):,}, blocks: {len(self.blocks):,}, frames: {self.num_frames:,}"
-        return f"{self.name!r}, version {self.version}, {sizes}"
+        return f"<Curriculum {self.name!r}, version {self.version}, {sizes}>"
 
     @cached_property
     def tasks(self) -> Sequence[TaskLike]:
@@ -394,11 +375,6 @@ class _DrawnIds(Mapping[TaskLike, int]):
 
     def __len__(self) -> int:
         return len({*map(self.stream.blocks.origin, range(len(self.ids)))})
-
-
-def _some(names: Sequence[str], between: str = ", ") -> str:
-    more = [f"{len(names) - SHOWN:,} more"] if len(names) > SHOWN else []
-    return between.join([*names[:SHOWN], *more])
 
 
 def _canonical(value: Any) -> Any:
