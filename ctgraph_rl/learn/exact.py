@@ -40,6 +40,36 @@ ActionProbs = Callable[[Tensor], Tensor]
 
 
 @torch.no_grad()
+def exact_measures(
+    policy: Any,
+    task: TaskLike,
+    *,
+    greedy: bool,
+    initial_state: InitialState | None = None,
+    task_id: Tensor | None = None,
+    shape: Sequence[int] | None = None,
+    gamma: float = 1.0,
+) -> Measures:
+    """Return the exact measures of a policy on a task, without torch's global generator.
+
+    Args:
+        policy: has ``action_probs``, see `ctgraph_rl.agent.Agent`.
+        task: a CT-graph for which `exact_rules` hold.
+        greedy: take the most likely actions; False samples and explores as in training.
+        initial_state: gives a recurrent policy's state for a number of rows; None or empty: no memory.
+        task_id: one-hot, uint8 [num_task_ids], where the protocol shows ids.
+        shape: of observations, where vectors are padded; None: the task's.
+        gamma: discount of the return, in [0, 1].
+
+    Raises:
+        ValueError: lists the reasons why there are no exact measures.
+    """
+    shown = ShownTask(task, tuple(task.observation_shape if shape is None else shape), task_id)  # type: ignore[arg-type]
+    [measures] = measures_by_seed(policy, 1, shown, greedy=greedy, initial_state=initial_state, gamma=gamma)
+    return measures
+
+
+@torch.no_grad()
 def measures_by_seed(
     policy: Any,
     num_seeds: int,
@@ -49,18 +79,7 @@ def measures_by_seed(
     initial_state: InitialState | None,
     gamma: float = 1.0,
 ) -> list[Measures]:
-    """Return the exact measures of each of several seeds on a task, without torch's global generator.
-
-    Args:
-        policy: has ``action_probs``, see `ctgraph_rl.agent.Agent`, of as many adjacent rows of each seed.
-        shown: a CT-graph for which `exact_rules` hold, and what observations show beside it.
-        greedy: take the most likely actions; False samples and explores as in training.
-        initial_state: gives a recurrent policy's state for a number of rows; None or empty: no memory.
-        gamma: discount of the return, in [0, 1].
-
-    Raises:
-        ValueError: lists the reasons why there are no exact measures.
-    """
+    """Return `exact_measures` of several seeds, whose ``policy`` acts on as many adjacent rows of each."""
     start = {} if initial_state is None else dict(initial_state(num_seeds).items())
     require(*exact_rules(policy, shown.task, start))
     seeds = _Seeds(policy, num_seeds, shown)
@@ -138,9 +157,7 @@ def _measure_function(policy: ActionProbs | nn.Module, task: Task, gamma: float)
         (are_graphs([task]), f"exact values are those of CT-graphs, got {type(task).__name__}"),
     )
     acts = as_policy(policy, task.num_actions) if isinstance(policy, nn.Module) else _Function(policy, task.num_actions)
-    shown = ShownTask(task, task.observation_shape, None)
-    [measures] = measures_by_seed(acts, 1, shown, greedy=False, initial_state=None, gamma=gamma)
-    return measures
+    return exact_measures(acts, task, greedy=False, gamma=gamma)
 
 
 @dataclass(frozen=True)

@@ -30,17 +30,11 @@ from ctgraph_rl import (
 )
 from ctgraph_rl.describe import describe
 from ctgraph_rl.learn.collect import PREVIOUS_ACTION
-from ctgraph_rl.learn.exact import ShownTask, measures_by_seed, shown_id
+from ctgraph_rl.learn.exact import ShownTask, exact_measures, measures_by_seed, shown_id
 from ctgraph_rl.learn.logits_policy import LogitsPolicy
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_posr_b1, ct_su_b1
 from ctgraph_rl.tasks.exactness import count_histories
 from ctgraph_rl.tasks.values import open_loop_ceiling
-
-
-def exact_measures(policy, task, *, greedy, initial_state=None, shape=None, gamma=1.0):
-    shown = ShownTask(task, shape or task.observation_shape, None)
-    [found] = measures_by_seed(policy, 1, shown, greedy=greedy, initial_state=initial_state, gamma=gamma)
-    return found
 
 
 def uniform(images):
