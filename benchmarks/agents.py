@@ -74,12 +74,13 @@ SEEDS_GOAL = 1024 * MAIN_JOB / (15 * 60)
 
 
 class Contender(NamedTuple):
-    """A learner: its speed, and what makes it for a seed.
+    """A learner that is made for a seed.
 
     It has ``learn``, which returns the frames that it learned from, and ``success``, a share of greedy episodes.
     """
 
-    rung: Rung
+    agent: str
+    who: str
     make: Callable[[int], Any]
 
 
@@ -155,16 +156,16 @@ def contenders(agents: list[str]) -> Iterator[Contender]:
             continue
         task = TASKS[label]
         values = on_256_rows(name)
-        yield contender(f"{name} on {label}", "ours", partial(Ours, values, task))
+        yield Contender(f"{name} on {label}", "ours", partial(Ours, values, task))
         if find_spec("sb3_contrib"):
             from benchmarks import stable  # needs Stable-Baselines3, which is optional
 
             for who, way in stable.ways().items():
-                yield contender(f"{name} on {label}", who, partial(stable.Stable, name, values, task, way))
+                yield Contender(f"{name} on {label}", who, partial(stable.Stable, name, values, task, way))
         if find_spec("jax") and (name, label) in IN_JAX:
             from benchmarks import jax_ppo  # needs JAX, which is optional
 
-            yield contender(f"{name} on {label}", "JAX", partial(jax_ppo.JAX, name, values, task))
+            yield Contender(f"{name} on {label}", "JAX", partial(jax_ppo.JAX, name, values, task))
 
 
 def cells(names: list[str]) -> Iterator[Contender]:
@@ -172,12 +173,7 @@ def cells(names: list[str]) -> Iterator[Contender]:
     for entry in catalogue("cell"):
         if entry.name in names:
             values = {**on_256_rows("lstm_ppo"), "cell": partial(entry.kind, **entry.settings)}
-            yield contender(f"lstm_ppo cell={entry.name}", "ours", partial(Ours, values, TASKS["CT-SU-B1"]))
-
-
-def contender(agent: str, who: str, make: Callable[[int], Any]) -> Contender:
-    """Return a contender whose speed is that of one learner over all rounds."""
-    return Contender(Rung(who, agent, ROWS, cache(lambda: make(0).learn)), make)
+            yield Contender(f"lstm_ppo cell={entry.name}", "ours", partial(Ours, values, TASKS["CT-SU-B1"]))
 
 
 def solve(learner: Any, max_frames: int) -> tuple[int, float] | None:
@@ -203,7 +199,7 @@ def times_to_solve(measured: Sequence[Contender], options: ladder.Options) -> st
     with suppress(KeyboardInterrupt):
         for seed, (one, times) in track(work, "learning", console=Console(stderr=True)):
             times.append(solve(one.make(seed), options.max_frames))
-    rows = [[one.rung.task, one.rung.name, *medians(times)] for one, times in zip(measured, found, strict=True)]
+    rows = [[one.agent, one.who, *medians(times)] for one, times in zip(measured, found, strict=True)]
     return markdown_table(("agent", "who", "frames to 90 %", "seconds to 90 %"), rows)
 
 
@@ -234,15 +230,11 @@ def rungs(device: torch.device, num_rows: Sequence[int], num_seeds: Sequence[int
             if name == "ppo":
                 ways["compiled and captured"] = partial(learner, {**given, "compile": True})
             for way, make in ways.items():
-                yield Rung(f"{name}, {way}", label, n, partial(_learn_of, make), GOALS[name])
+                yield Rung(f"{name}, {way}", label, n, lambda make=make: make().learn, GOALS[name])
         for count in num_seeds:
             goal = SEEDS_GOAL if name == "lstm_ppo" else 0.0
             together = partial(seeds, values, task, count, device)
             yield Rung(f"{name}, {count:,} seeds as one job", label, count * values["num_envs"], together, goal)
-
-
-def _learn_of(make: Callable[[], Ours]) -> TimedRun:
-    return make().learn
 
 
 def seeds(values: NamedValues, task: Task, num_seeds: int, device: torch.device) -> TimedRun:
@@ -291,8 +283,7 @@ def main(arguments: list[str] | None = None) -> None:
         for rung in rungs(device, options.rows, options.together):
             if rung.name == ENVIRONMENT or rung.name.partition(",")[0] in options.agents:
                 on_device.append(rung)
-        ladder.climb(on_device, options, device)
-        print(ladder.report(on_device, options, device, ENVIRONMENT))
+        ladder.climb(on_device, options, device, ENVIRONMENT)
         return
     console = Console(stderr=True)
     if not find_spec("sb3_contrib"):
@@ -301,9 +292,11 @@ def main(arguments: list[str] | None = None) -> None:
     if not find_spec("jax"):
         console.print("JAX is missing and not measured: pip install jax", markup=False, soft_wrap=True)
     measured = list(contenders(options.agents) if options.cells is None else cells(options.cells or known))
-    speeds = [one.rung for one in measured]
-    ladder.climb(speeds, options, CPU, in_turn=True)
-    print(ladder.report(speeds, options, CPU, "ours"))
+    speeds = []
+    for one in measured:
+        learner = cache(partial(one.make, 0))  # one learns in all rounds
+        speeds.append(Rung(one.who, one.agent, ROWS, lambda learner=learner: learner().learn))
+    ladder.climb(speeds, options, CPU, "ours", in_turn=True)
     if options.seeds:
         print(f"\n{times_to_solve(measured, options)}")
 

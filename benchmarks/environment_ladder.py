@@ -213,8 +213,10 @@ def parsed(parser: argparse.ArgumentParser, arguments: list[str] | None, seconds
     return options
 
 
-def climb(rungs: list[Rung], options: Options, device: torch.device, in_turn: bool = False) -> None:
-    """Measure a ladder as the options say, or until Ctrl-C.
+def climb(
+    rungs: list[Rung], options: Options, device: torch.device, yardstick: str = COPY, in_turn: bool = False
+) -> None:
+    """Measure a ladder as the options say, or until Ctrl-C, and print the machine and the table.
 
     Args:
         in_turn: every round measures each rung once, so that all suffer alike; else each rung is made, measured and
@@ -225,12 +227,7 @@ def climb(rungs: list[Rung], options: Options, device: torch.device, in_turn: bo
     with suppress(KeyboardInterrupt):
         for rung in track(rungs * times, "measuring", console=Console(stderr=True)):
             measure(rung, rounds, options.seconds, device)
-
-
-def report(rungs: list[Rung], options: Options, device: torch.device, yardstick: str = COPY) -> str:
-    """Return the machine and a ladder's table."""
-    about = f"{machine(device)}; medians of {options.rounds} rounds"
-    return f"{about}\n\n{table(found(rungs, yardstick), yardstick)}"
+    print(f"{machine(device)}; medians of {options.rounds} rounds\n\n{table(found(rungs, yardstick), yardstick)}")
 
 
 def machine(device: torch.device) -> str:

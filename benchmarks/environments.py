@@ -201,12 +201,9 @@ def contenders(num_rows: list[int], names: list[str], with_kernel: bool) -> list
     """Everything measured on the CPU, in the table's order."""
     found: list[Rung] = []
 
-    def made(run: TimedRun) -> Callable[[], TimedRun]:
-        return lambda: run
-
     def add(configuration: str, n: int, ways: NamedRuns) -> None:
         for name, run in ways:
-            found.append(Rung(name, configuration, n, made(run)))
+            found.append(Rung(name, configuration, n, lambda run=run: run))
 
     tasks = configurations()
     ways = tuple(SUFFIX)[: 1 + with_kernel]
@@ -242,14 +239,10 @@ def main(arguments: list[str] | None = None) -> None:
     if options.device:
         device = checked_device(options.device)
         tasks = {name: configurations()[name] for name in options.tasks}
-        measured = ladder.rungs(device, rows, tasks)
-        ladder.climb(measured, options, device)
-        print(ladder.report(measured, options, device))
+        ladder.climb(ladder.rungs(device, rows, tasks), options, device)
         return
-    device = torch.device("cpu")
     measured = contenders(rows, options.tasks, not options.skip_kernel)
-    ladder.climb(measured, options, device, in_turn=True)
-    print(ladder.report(measured, options, device, MEMCPY))
+    ladder.climb(measured, options, torch.device("cpu"), MEMCPY, in_turn=True)
 
 
 if __name__ == "__main__":
