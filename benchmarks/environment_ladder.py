@@ -267,7 +267,7 @@ def finished(device: torch.device) -> float:
     return time.perf_counter()
 
 
-def found(measured: Sequence[Rung], yardstick: str = COPY) -> list[dict[str, Any]]:
+def found(measured: Sequence[Rung], yardstick: str) -> list[dict[str, Any]]:
     """Return medians and their ratios to the yardstick as plain values.
 
     The yardstick has the same task and rows, or else the most rows.
@@ -294,7 +294,7 @@ def found(measured: Sequence[Rung], yardstick: str = COPY) -> list[dict[str, Any
     return rows
 
 
-def table(rows: Sequence[Mapping[str, Any]], yardstick: str = COPY) -> str:
+def table(rows: Sequence[Mapping[str, Any]], yardstick: str) -> str:
     """Format `found` in Markdown, with ratios to the yardstick and shares of the goal."""
     lines = []
     for row in rows:

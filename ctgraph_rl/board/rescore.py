@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from ctgraph_rl.board.method_yaml import fact_rules, facts_of, track_version
 from ctgraph_rl.board.submission import Submission, SubmittedRun, log_sum
-from ctgraph_rl.board.tracks import TUNING_SEEDS, Track
+from ctgraph_rl.board.tracks import TUNING_SEEDS, Track, write_seeds
 from ctgraph_rl.checks import ReadOnlyValues, Rule, require
 from ctgraph_rl.learn.evaluate import Evaluator
 from ctgraph_rl.log.escape import listed
@@ -190,19 +190,13 @@ def seed_rules(seeds: Iterable[int], tuned: Iterable[int], of_track: Track | Non
     reserved = own & set(TUNING_SEEDS)
     missing = wanted - own
     others = own - wanted - reserved
-    asked = f"track {of_track.id} has seeds {_ranges(wanted)}"
+    asked = f"track {of_track.id} has seeds {write_seeds(wanted)}"
     return [
         *rules,
         (not missing, f"seeds {listed(sorted(missing))} are missing: {asked}"),
         (not reserved, f"seeds {listed(sorted(reserved))} are for tuning: {asked}"),
         (not others, f"seeds {listed(sorted(others))} are of no submission: {asked}"),
     ]
-
-
-def _ranges(seeds: Iterable[int]) -> str:
-    ordered = sorted(seeds)
-    whole = len(ordered) > 2 and ordered == list(range(ordered[0], ordered[-1] + 1))
-    return f"{ordered[0]}..{ordered[-1]}" if whole else ", ".join(map(str, ordered))
 
 
 def entry_rule(config: ReadOnlyValues, entry_point: str | None) -> Rule:

@@ -8,7 +8,7 @@ be given less than the track gives: each of these is a `Variant`.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,7 +25,6 @@ from ctgraph_rl.runs.job import with_changes
 from ctgraph_rl.runs.settings import names_in
 from ctgraph_rl.runs.sweep import swept
 from ctgraph_rl.tasks.curriculum import Curriculum
-from ctgraph_rl.tasks.protocol import Protocol
 
 TUNING_SEEDS = range(100, 200)
 """Seeds for choosing the hyperparameters of a submission."""
@@ -63,8 +62,14 @@ class Variant:
 
     @property
     def given(self) -> str:
-        """What the learner is given to know of tasks, in words."""
-        return given(self.curriculum.protocol, len(self.curriculum.blocks))
+        """What the learner is given to know of tasks, in words; several blocks have boundaries."""
+        protocol = self.curriculum.protocol
+        parts = {"one_hot": ["task ids"], "at_boundaries": ["task ids at boundaries"], "hidden": []}[protocol.task_id]
+        if len(self.curriculum.blocks) > 1 and protocol.announces and protocol.task_id != "at_boundaries":
+            parts.append("boundaries")
+        if protocol.guide_frames:
+            parts.append("first rewards")
+        return ", ".join(parts) or "nothing"
 
 
 @dataclass(frozen=True)
@@ -143,14 +148,11 @@ def held_out_seeds(key: str, count: int) -> tuple[int, ...]:
     return tuple(found)
 
 
-def given(protocol: Protocol, blocks: int) -> str:
-    """Return in words what a learner is given to know of tasks; several blocks have boundaries."""
-    parts = {"one_hot": ["task ids"], "at_boundaries": ["task ids at boundaries"], "hidden": []}[protocol.task_id]
-    if blocks > 1 and protocol.announces and protocol.task_id != "at_boundaries":
-        parts.append("boundaries")
-    if protocol.guide_frames:
-        parts.append("first rewards")
-    return ", ".join(parts) or "nothing"
+def write_seeds(seeds: Iterable[int]) -> str:
+    """Return seeds in words, such as ``0 to 19``."""
+    ordered = sorted(seeds)
+    whole = len(ordered) > 2 and ordered == list(range(ordered[0], ordered[-1] + 1))
+    return f"{ordered[0]} to {ordered[-1]}" if whole else ", ".join(map(str, ordered))
 
 
 def track(name: str, config_dir: Path | None = None) -> Track:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from yaml_settings import ALONE, escaped
 
 from ctgraph_rl.board.standings.track_ceilings import ceilings_of, write_ceiling
-from ctgraph_rl.board.tracks import HELD_OUT_SEEDS, TUNING_SEEDS, Track, tracks
+from ctgraph_rl.board.tracks import HELD_OUT_SEEDS, TUNING_SEEDS, Track, tracks, write_seeds
 
 
 def track_cards() -> Iterator[tuple[str, str]]:
@@ -28,16 +28,14 @@ def track_cards() -> Iterator[tuple[str, str]]:
 
 
 def _card(track: Track) -> str:
-    seeds = f"{track.seeds[0]} to {track.seeds[-1]}"
-    tuning = f"{TUNING_SEEDS[0]} to {TUNING_SEEDS[-1]}"
     names = dict.fromkeys(variant.curriculum.name for variant in track.variants)
     facts = {
         "curriculum": ", ".join(
             f"[`{name}`](../curricula/{name}.md), modified where settings differ" for name in names
         ),
         "score": f"`{track.score}`",
-        "seeds of a submission": seeds,
-        "seeds for tuning": tuning,
+        "seeds of a submission": write_seeds(track.seeds),
+        "seeds for tuning": write_seeds(TUNING_SEEDS),
         "seeds that verifiers draw from": f"{HELD_OUT_SEEDS[0]:,} to {HELD_OUT_SEEDS[-1]:,}",
     }
     which = "every rung as the track gives it" if len(track.rungs) > 1 else "the first one"

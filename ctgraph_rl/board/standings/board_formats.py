@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from ctgraph_rl.board.standings.board_tables import BoardTable, Standing, is_significant
 from ctgraph_rl.board.standings.track_ceilings import write_ceiling
+from ctgraph_rl.board.tracks import write_seeds
 from ctgraph_rl.board.verification import STATES
 from ctgraph_rl.log.escape import csv_text
 from ctgraph_rl.report.formats import MEANS, measure_name
@@ -66,12 +67,10 @@ def notes(table: BoardTable) -> list[str]:
 def facts(table: BoardTable) -> list[tuple[str, str]]:
     """Return what a table's tasks allow, with budget and seeds."""
     curriculum = table.variant.curriculum
-    seeds = table.track.seeds
-    whole = seeds == tuple(range(seeds[0], seeds[-1] + 1))
     about = [
         ("curriculum", f"{curriculum.name}, fingerprint {curriculum.fingerprint}"),
         ("steps", f"{curriculum.num_frames:,}"),
-        ("seeds", f"{seeds[0]} to {seeds[-1]}" if whole else ", ".join(map(str, seeds))),
+        ("seeds", write_seeds(table.track.seeds)),
     ]
     for name, value in table.ceilings.items():
         if value is not None:
