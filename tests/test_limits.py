@@ -21,7 +21,7 @@ import curricula
 from ctgraph_rl import Curriculum, RunLog, Task, strict
 from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.saved import read_plain
-from ctgraph_rl.log.sums import sums_of, write_metrics
+from ctgraph_rl.log.sums import write_metrics
 from ctgraph_rl.log.tables import write_tables
 from ctgraph_rl.runs.checkpoints import BrokenCheckpoint, decoded
 from ctgraph_rl.runs.read import find_runs
@@ -230,7 +230,10 @@ def test_no_reader_opens_a_pipe_or_a_device(tmp_path, make):
 @pytest.mark.parametrize("name", ["curriculum.json", "agent.pt", "metrics.json"])
 def test_no_pipe_or_device_is_opened_to_see_whether_a_run_is_whole(tmp_path, make, name):
     log_of(tmp_path / "run", ABOUT, LINE)
-    (tmp_path / "run" / name).unlink(missing_ok=True)
+    for each in ("curriculum.json", "agent.pt"):
+        (tmp_path / "run" / each).write_bytes(b"")
+    write_metrics(tmp_path / "run" / "metrics.json", {})
+    (tmp_path / "run" / name).unlink()
     make(tmp_path / "run" / name)
 
     assert damaged(tmp_path / "run") == [name]
@@ -247,7 +250,7 @@ def test_a_log_that_is_a_pipe_or_a_device_is_not_blank(tmp_path, make):
 @pytest.mark.parametrize("name", ["run.jsonl", "metrics.json"])
 def test_a_file_of_another_length_is_not_read_for_its_sum(tmp_path, name):
     log_of(tmp_path / "run", ABOUT, LINE)
-    write_metrics(tmp_path / "run" / "metrics.json", {}, sums_of(tmp_path / "run"))
+    write_metrics(tmp_path / "run" / "metrics.json", {})
     with (tmp_path / "run" / name).open("wb") as file:
         file.truncate(2**40)  # on the disk it has no bytes
 

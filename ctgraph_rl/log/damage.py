@@ -1,16 +1,13 @@
-"""Finds the files of a finished run that are not as they were written; without sums they must only be readable."""
+"""Finds the files of a finished run that are not as they were written."""
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 from typing import Any
 
 from ctgraph_rl.checks import NamedValues, is_real, require
-from ctgraph_rl.disk import read_regular
-from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG, METRICS
+from ctgraph_rl.log.files import METRICS
 from ctgraph_rl.log.measurement import LARGEST
-from ctgraph_rl.log.run_log import MOST_BYTES, RunLog
 from ctgraph_rl.log.sums import FILES, stored_sums
 from ctgraph_rl.strict import json_value, sha256_of
 
@@ -21,12 +18,8 @@ def damaged(run_dir: Path) -> list[str]:
     """Return the files of a complete run that are not as they were written; reads all of them."""
     try:
         sums = stored_sums(run_dir)
-    except FileNotFoundError:
-        sums = None
     except (OSError, ValueError):
         return [METRICS]
-    if sums is None:
-        return [name for name in (LOG, CURRICULUM, AGENT) if not _is_readable(run_dir / name)]
     found = []
     for name, stored in sums.items():
         path = run_dir / name
@@ -34,22 +27,6 @@ def damaged(run_dir: Path) -> list[str]:
         if not there or sha256_of(path, MOST_BYTES_OF_A_FILE) != stored["sha256"]:
             found.append(name)
     return found
-
-
-def _is_readable(path: Path) -> bool:
-    try:
-        if not path.exists():
-            return path.name != LOG
-        if not path.is_file():
-            return False
-        if path.name == AGENT:
-            return zipfile.is_zipfile(path)
-        if path.name == CURRICULUM:
-            return isinstance(json_value(read_regular(path, MOST_BYTES)), dict)
-        log = RunLog.read(path)
-        return bool(log.of_kind("run")) and not log.torn_lines
-    except (OSError, ValueError, RecursionError):
-        return False
 
 
 def metrics_of(content: bytes) -> NamedValues:

@@ -23,12 +23,11 @@ RESULTS = (LOG, CURRICULUM, AGENT, METRICS)
 """Files of a run, in the order of writing; ``curriculum.json`` only for parts of this package's classes."""
 
 
-def write_metrics(
-    path: Path | str, metrics: ReadOnlyValues, sums: ReadOnlyValues | None = None, of_windows: Collection[str] = ()
-) -> None:
+def write_metrics(path: Path, metrics: ReadOnlyValues, of_windows: Collection[str] = ()) -> None:
     """Write metrics as JSON, one a line: by name the value, definition, formula and source, or why it is undefined.
 
-    Terms are left out, as pairs of tasks grow with the square of tasks; `ctgraph_rl.log.scores.scores` has them.
+    Terms are left out, as pairs of tasks grow with the square of tasks; `ctgraph_rl.log.scores.scores` has them. The
+    sums of the files beside it are written, too.
 
     Args:
         of_windows: metrics whose terms are few, and kept as ``windows``.
@@ -38,10 +37,8 @@ def write_metrics(
         values = {**vars(metric), "n_seeds": 1, "interval": None}
         terms = values.pop("terms")
         content[name] = {**values, "windows": terms} if name in of_windows else values
-    if sums is not None:
-        files = {**sums, METRICS: _sum_of_metrics(content)}
-        content = {FILES: {"run": uuid4().hex, **files}, **content}
-    lines = [f"{json.dumps(name)}: {json.dumps(value)}" for name, value in content.items()]
+    files = {"run": uuid4().hex, **sums_of(path.parent), METRICS: _sum_of_metrics(content)}
+    lines = [f"{json.dumps(name)}: {json.dumps(value)}" for name, value in {FILES: files, **content}.items()]
     write_whole(path, "{\n" + ",\n".join(lines) + "\n}\n")
 
 
@@ -61,31 +58,25 @@ def sums_of(run_dir: Path) -> NamedValues:
 def is_complete(run_dir: Path) -> bool:
     """Return whether a run says that it is complete and its files have their lengths.
 
-    Without sums, files must not be empty. Only the metrics are read, as a sweep asks this of every cell.
+    Only the metrics are read, as a sweep asks this of every cell.
     """
     try:
         sums = stored_sums(run_dir)
+        return all((run_dir / name).stat().st_size == stored["bytes"] for name, stored in sums.items())
     except (OSError, ValueError):
         return False
-    sizes = {name: (run_dir / name).stat().st_size for name in RESULTS if (run_dir / name).exists()}
-    if sums is None:
-        return all(sizes.values())
-    return all(sizes.get(name) == sums[name]["bytes"] for name in sums)
 
 
-def stored_sums(run_dir: Path) -> Mapping[str, Mapping[str, Any]] | None:
-    """Return the stored sums of all files but the metrics, which are compared; None if there are none.
+def stored_sums(run_dir: Path) -> Mapping[str, Mapping[str, Any]]:
+    """Return the stored sums of all files but the metrics, which are compared.
 
     Raises:
         OSError: without metrics.
         ValueError: if they are not what was written.
     """
     content = json_value(read_regular(run_dir / METRICS, MOST_BYTES_OF_METRICS))
-    require((isinstance(content, dict), "it does not hold metrics of ours"))
-    if FILES not in content:
-        return None
-    files = content.pop(FILES)
     try:
+        files = content.pop(FILES)
         own = files.pop(METRICS)
         del files["run"]
         are_sums = all(name in RESULTS and {"bytes", "sha256"} <= files[name].keys() for name in files)

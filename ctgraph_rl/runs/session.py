@@ -32,7 +32,7 @@ from ctgraph_rl.log.provenance import NUMBERS_TOGETHER, code_changes, machine, p
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.saved import without_moments
 from ctgraph_rl.log.scores import scores
-from ctgraph_rl.log.sums import RESULTS, sums_of, write_metrics
+from ctgraph_rl.log.sums import RESULTS, write_metrics
 from ctgraph_rl.metrics.windows import OF_LIFE
 from ctgraph_rl.packages import check_packages
 from ctgraph_rl.runs import config
@@ -142,7 +142,7 @@ class RunMember(Member):
             write_whole(self.run_dir / AGENT, weights.getvalue())
         experts = None if self.experts is None else [expert.log for expert in self.experts]
         metrics = scores(self.log, self.curriculum, experts)
-        write_metrics(self.run_dir / METRICS, metrics, sums_of(self.run_dir), OF_LIFE)
+        write_metrics(self.run_dir / METRICS, metrics, OF_LIFE)
         self.checkpoints.clear()
 
 

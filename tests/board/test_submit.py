@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from helpers.made_runs import remove_sums
+from helpers.made_runs import sum_again
 from helpers.sweeping import command_line
 
 from ctgraph_rl import Recorder, RunLog
@@ -36,12 +36,12 @@ def runs(tiny_home, tmp_path) -> Path:
 
 
 def edit(run: Path, change: Callable[[dict], object]) -> None:
-    """Change the first line of a run's log; without sums, as runs of earlier versions have none."""
+    """Change the first line of a run's log."""
     first, rest = (run / "run.jsonl").read_text().split("\n", 1)
     about = json.loads(first)
     change(about)
     (run / "run.jsonl").write_text(json.dumps(about) + "\n" + rest)
-    remove_sums(run)
+    sum_again(run)
 
 
 def test_a_submission_has_a_line_for_each_seed_and_what_the_logs_give(tiny_submission, tiny_home, tiny_track):

@@ -25,7 +25,7 @@ from ctgraph_rl.board.submit import submit
 from ctgraph_rl.log.provenance import NUMBERS
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.scores import scores
-from ctgraph_rl.log.sums import sums_of, write_metrics
+from ctgraph_rl.log.sums import write_metrics
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 ENTRY = """
@@ -127,7 +127,7 @@ def test_a_log_that_was_edited_with_all_that_follows_from_it_is_found_by_a_rerun
         lines = [{**m, "return_mean": 1.0} if m["kind"] == "evaluation" else m for m in log.measurements]
         (run_dir / "run.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
         found = scores(RunLog.read(run_dir / "run.jsonl"), Curriculum.from_json(run_dir / "curriculum.json"))
-        write_metrics(run_dir / "metrics.json", found, sums_of(run_dir))
+        write_metrics(run_dir / "metrics.json", found)
     folder = submitted(tmp_path, tiny_track, method, tmp_path / "submission")
 
     code, written = call(monkeypatch, tiny_home, folder, "--cells=1", "--yes")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ctgraph_rl import RunLog, metrics
 from ctgraph_rl.log.provenance import NUMBERS
-from ctgraph_rl.log.sums import write_metrics
+from ctgraph_rl.log.sums import sum_of, sums_of, write_metrics
 from ctgraph_rl.runs.read import find_runs
 
 LABELS = ("goal1", "goal2")
@@ -117,8 +117,9 @@ def line(rows, measure: str, agent: str = "PPO"):
     return found
 
 
-def remove_sums(run_dir: Path) -> None:
-    """Make a finished run one without sums, whose files must only be readable."""
+def sum_again(run_dir: Path) -> None:
+    """Give a finished run whose files were changed the sums of these."""
     content = json.loads((run_dir / "metrics.json").read_text())
-    content.pop("files", None)
-    (run_dir / "metrics.json").write_text(json.dumps(content))
+    del content["files"]
+    sums = {"run": "0", **sums_of(run_dir), "metrics.json": sum_of(json.dumps(content).encode())}
+    (run_dir / "metrics.json").write_text(json.dumps({"files": sums, **content}))
