@@ -179,6 +179,7 @@ def learned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Path]:
     """The cells that were run, in a folder of their own, by a learner that needs no time; it fails for one seed."""
     from helpers.sweeping import UNLUCKY
 
+    from ctgraph_rl.log.sums import write_metrics
     from ctgraph_rl.runs import config, job
 
     cells: list[Path] = []
@@ -190,7 +191,7 @@ def learned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Path]:
         (run_dir / "run.jsonl").write_text(json.dumps(first) + "\n")
         if cfg.seed == UNLUCKY:
             raise FloatingPointError("the loss is NaN")
-        (run_dir / "metrics.json").write_text("{}")
+        write_metrics(run_dir / "metrics.json", {})
         return {}
 
     monkeypatch.setattr(job, "learn", learn)

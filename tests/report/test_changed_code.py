@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from helpers.learning import train
-from helpers.made_runs import all_runs
+from helpers.made_runs import all_runs, sum_again
 from helpers.small_agents import SMALL_AGENT
 from helpers.sweeping import command_line, sweep
 from rich.console import Console
@@ -303,6 +303,7 @@ def without(path: Path, *names: str) -> None:
     first, *rest = path.read_text().splitlines(keepends=True)
     about = {name: value for name, value in json.loads(first).items() if name not in names}
     path.write_text(json.dumps(about) + "\n" + "".join(rest))
+    sum_again(path.parent)
 
 
 def test_a_run_that_does_not_say_its_code_is_of_version_1_and_of_unknown_source(mine, ran, monkeypatch, capsys):

@@ -13,6 +13,7 @@ from helpers.sweeping import command_line
 from ctgraph_rl import Block, Curriculum, Evaluation, Protocol, RunLog
 from ctgraph_rl.log import files
 from ctgraph_rl.log.provenance import NUMBERS, versions
+from ctgraph_rl.log.sums import write_metrics
 from ctgraph_rl.run import run
 from ctgraph_rl.runs import job
 from ctgraph_rl.runs.experts import directory_name, expert_curriculum, find_or_train
@@ -37,9 +38,9 @@ def write_result(trained: list):
     return learn
 
 
-def finish(run_dir, log: str = '{"kind": "run"}\n', metrics: str = "{}") -> None:
-    (run_dir / "run.jsonl").write_text(log)
-    (run_dir / "metrics.json").write_text(metrics)
+def finish(run_dir) -> None:
+    (run_dir / "run.jsonl").write_text('{"kind": "run"}\n')
+    write_metrics(run_dir / "metrics.json", {})
 
 
 def test_an_expert_has_its_task_alone_for_the_frames_of_its_first_block():
@@ -103,7 +104,7 @@ def test_an_expert_that_was_stopped_is_gone_on_with(tmp_path):
     def go_on(alone, run_dirs, session):
         [run_dir] = run_dirs.values()
         assert (run_dir / "run.jsonl").read_text() == "half"
-        (run_dir / "metrics.json").write_text("{}")
+        write_metrics(run_dir / "metrics.json", {})
         return {}
 
     with pytest.raises(KeyboardInterrupt):
@@ -142,7 +143,7 @@ def test_an_expert_that_another_process_trains_is_waited_for_and_not_trained_aga
     alone = expert_curriculum(curriculum(Block(ONE, 12)), ONE)
     run_dir = tmp_path / directory_name(alone, SETTINGS)
     run_dir.mkdir()
-    waited = []
+    waited, theirs = [], []
 
     with ExitStack() as other:
         other.enter_context(files.locked(run_dir))
@@ -150,7 +151,8 @@ def test_an_expert_that_another_process_trains_is_waited_for_and_not_trained_aga
         def waiting():
             waited.append(1)
             if len(waited) == 3:
-                finish(run_dir, metrics='{"theirs": 1}')
+                finish(run_dir)
+                theirs.append((run_dir / "metrics.json").read_text())
                 other.close()
 
         learn = lambda *_: pytest.fail("trained twice")  # noqa: E731
@@ -158,7 +160,7 @@ def test_an_expert_that_another_process_trains_is_waited_for_and_not_trained_aga
 
     [expert] = found[0]
     assert len(waited) == 3
-    assert (expert.run_dir / "metrics.json").read_text() == '{"theirs": 1}'
+    assert [(expert.run_dir / "metrics.json").read_text()] == theirs
 
 
 def test_an_expert_is_kept_by_agent_seed_device_threads_and_versions(compose, monkeypatch, tmp_path):

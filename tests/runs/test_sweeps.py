@@ -27,6 +27,7 @@ from omegaconf import OmegaConf
 from rich.console import Console
 
 from ctgraph_rl.log.files import locked
+from ctgraph_rl.log.sums import write_metrics
 from ctgraph_rl.run import MOST_IN_TABLE, show_sweep
 from ctgraph_rl.runs import job
 from ctgraph_rl.runs.explain import explain
@@ -403,7 +404,7 @@ def test_the_status_of_a_cell_is_read_from_its_directory(tmp_path):
     with locked(tmp_path):
         found.append(status_of(tmp_path))
     (tmp_path / "run.jsonl").write_text("{}\n")
-    (tmp_path / "metrics.json").write_text("{}")
+    write_metrics(tmp_path / "metrics.json", {})
     found.append(status_of(tmp_path))
 
     assert [state for state, _ in found] == ["missing", "missing", "failed", "in use", "done"]
@@ -451,7 +452,7 @@ def test_progress_counts_cells_and_tells_the_time_left(tmp_path):
     cells = [tmp_path / str(number) for number in range(300)]
     for cell in cells[:10]:
         cell.mkdir()
-        (cell / ("failed.txt" if cell == cells[3] else "metrics.json")).write_text("{}")
+        write_metrics(cell / ("failed.txt" if cell == cells[3] else "metrics.json"), {})
     progress = SweepProgress(dict.fromkeys(cells, RunOutcome()), console=Console(file=io.StringIO()))
 
     done, failed, running = progress.look()
@@ -482,7 +483,7 @@ def test_progress_on_a_terminal_ends_with_the_cells_that_were_done_last(tmp_path
     with SweepProgress(dict.fromkeys([tmp_path / "a", tmp_path / "b"], RunOutcome()), console):
         for name in "ab":
             (tmp_path / name).mkdir()
-            (tmp_path / name / "metrics.json").write_text("{}")
+            write_metrics(tmp_path / name / "metrics.json", {})
 
     assert "2/2 cells done" in shown.getvalue()
 
@@ -498,7 +499,7 @@ def test_progress_without_a_terminal_is_a_line_a_minute(tmp_path, monkeypatch):
     shown = Shown()
     monkeypatch.setattr("ctgraph_rl.runs.status.SECONDS_BETWEEN_LINES", 0.0)
 
-    (tmp_path / "metrics.json").write_text("{}")  # done before, so it tells nothing of the rate
+    write_metrics(tmp_path / "metrics.json", {})  # done before, so it tells nothing of the rate
     cells = dict.fromkeys([tmp_path, tmp_path / "b"], RunOutcome())
     with SweepProgress(cells, console=Console(file=shown)):
         assert is_shown.wait(60)
