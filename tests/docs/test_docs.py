@@ -50,7 +50,7 @@ REFUSED = [
     (lambda: read(graph_shape__p=1.0), "wait_prob must be in [0, 1), got 1.0"),
     (lambda: read(graph_shape__d=0), "depth must be an integer >= 1, got 0"),
     (lambda: read(graph_shape__b=1), "branching_factor must be an integer >= 2, got 1"),
-    (lambda: replace(read(), step_reward=-0.01).to_json(), "the file cannot express step_reward=-0.01: use 0"),
+    (lambda: replace(read(), step_reward=-0.01).to_json(), "the file cannot express step_reward=-0.01: use 0.0"),
     (lambda: read(reward__fail_r=DELETED), "configuration: reward.fail_r is missing"),
     (lambda: read(observations__graph_ends=DELETED), "configuration: observations.graph_ends is missing"),
     (
