@@ -271,11 +271,16 @@ def _ceilings(curriculum: Curriculum) -> Sheet:
     for task, label in _labelled(curriculum):
         limited[CHANGING_GOALS] |= task.goal_change is not None
         limited[NOISE_AS_DICE] |= bool(task.observations.read_noise or task.observations.read_rotation)
-        found = [_ceiling(task, ceiling) for ceiling in CEILINGS.values()]
-        rows.append((label, *(UNKNOWN if value is None else _number(value) for value, _ in found)))
-        reasons += [f"{UNKNOWN}: {reason}" for _, reason in found if reason]
-        memoryless = found[1][0]
-        optimal = found[3][0]
+        found: list[float | None] = []
+        for ceiling in CEILINGS.values():
+            try:
+                found.append(ceiling(task))
+            except ValueError as error:
+                found.append(None)
+                reasons.append(f"{UNKNOWN}: {error}")
+        rows.append((label, *(UNKNOWN if value is None else _number(value) for value in found)))
+        memoryless = found[1]
+        optimal = found[3]
         alike = not task.observations.unique_decisions and task.goal_change is None
         if alike and None not in (memoryless, optimal) and memoryless == optimal:
             easy.append(label)
@@ -286,13 +291,6 @@ def _ceilings(curriculum: Curriculum) -> Sheet:
     needed = [f"{NEEDS_MEMORY} {listed(lost, MOST_LOST)}."] if lost else []
     notes = (*CEILING_NOTES, *dict.fromkeys(reasons), *needed, *compress(limited, limited.values()), *easily)
     return Sheet("Ceilings", {"task": "l", **dict.fromkeys(CEILINGS, "r")}, tuple(rows), notes)
-
-
-def _ceiling(task: Task, ceiling: Callable[[Task], float]) -> tuple[float | None, str]:
-    try:
-        return ceiling(task), ""
-    except ValueError as error:
-        return None, str(error)
 
 
 def _observations(curriculum: Curriculum) -> Sheet:

@@ -19,22 +19,18 @@ def main(argv: Sequence[str] | None = None) -> None:
     with refused_by(parser):
         if arguments.command in (None, "list") and arguments.config_dir is None:
             _show_list(listed(), arguments.format)
+            return
+        from ctgraph_rl import describe  # here: a list of what is published needs no torch
+
+        if arguments.command == "probabilities":
+            show([describe.probabilities()], arguments.format)
+        elif arguments.command == "describe":
+            curriculum = describe.find_curriculum(arguments.name, arguments.config_dir)
+            show(describe.describe(curriculum, arguments.frames_per_second), arguments.format)
+            describe.write(curriculum, arguments.figure, arguments.similarity, arguments.json)
         else:
-            _compute(arguments)
-
-
-def _compute(arguments: argparse.Namespace) -> None:
-    from ctgraph_rl import describe  # here: a list of what is published needs no torch
-
-    if arguments.command == "probabilities":
-        show([describe.probabilities()], arguments.format)
-    elif arguments.command == "describe":
-        curriculum = describe.find_curriculum(arguments.name, arguments.config_dir)
-        show(describe.describe(curriculum, arguments.frames_per_second), arguments.format)
-        describe.write(curriculum, arguments.figure, arguments.similarity, arguments.json)
-    else:
-        own = describe.listing(describe.own_curricula(arguments.config_dir))
-        _show_list((*listed(), *own.rows), arguments.format)
+            own = describe.listing(describe.own_curricula(arguments.config_dir))
+            _show_list((*listed(), *own.rows), arguments.format)
 
 
 def _show_list(rows: tuple[tuple[str, ...], ...], form: str) -> None:

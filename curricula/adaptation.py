@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 from ctgraph_rl.checks import at_least_one, by_name, is_int, require, takes_numbers
@@ -12,7 +11,7 @@ from ctgraph_rl.tasks.images import OneHot, PaperImages
 from ctgraph_rl.tasks.observations import Observations
 from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from ctgraph_rl.tasks.task import Task
-from curricula.axes import OneOrMore, Tasks, all_goals, cycle, given_goals, random_goals, reshaped, sequence
+from curricula.axes import OneOrMore, all_goals, cycle, given_goals, random_goals, reshaped, sequence
 from curricula.draws import below, generator
 from curricula.published import full_mdp, goal_of, lab_task
 
@@ -73,31 +72,25 @@ def penn_a_swap(
     episode = _longest_episode(depth) * num_rows
     evaluation = None
     if num_lives is None:
-        tasks: Sequence[OneOrMore] = random_goals(task, 2, seed)
+        tasks: list[OneOrMore] = [*random_goals(task, 2, seed)]
         frames = [50 * episode if num_frames is None else num_frames] * 2
     else:
         goals = all_goals(task)
-        tasks, moments = _lives(goals, num_lives, seed)
-        frames = [episodes * episode for moment in moments for episodes in (moment, 100 - moment)]
+        source = generator(seed)
+        tasks = []
+        frames = []
+        for _ in range(num_lives):
+            first = below(source, len(goals))
+            second = (first + 1 + below(source, len(goals) - 1)) % len(goals)
+            tasks += [goals[first:] + goals[:first], goals[second:] + goals[:second]]
+            moment = 35 + below(source, 31)
+            frames += [moment * episode, (100 - moment) * episode]
         swapped = all_goals(replace(task, goal_change=(50, 50)))
         every = 10 if num_lives % 10 == 0 else num_lives
         evaluation = Evaluation(
             400, episodes_per_row=100, at_block_ends=False, every=every * 100 * episode, held_out=swapped
         )
     return sequence("penn_a_swap", tasks, frames, source=PENN_A, protocol=UNANNOUNCED, evaluation=evaluation)
-
-
-def _lives(goals: Tasks, num_lives: int, seed: int) -> tuple[list[Tasks], list[int]]:
-    source = generator(seed)
-    count = len(goals)
-    tasks = []
-    moments = []
-    for _ in range(num_lives):
-        first = below(source, count)
-        second = (first + 1 + below(source, count - 1)) % count
-        tasks += [goals[first:] + goals[:first], goals[second:] + goals[:second]]
-        moments.append(35 + below(source, 31))
-    return tasks, moments
 
 
 def dick2020_pair(num_frames: int = 51_200, one_hot: bool = True) -> Curriculum:

@@ -73,7 +73,13 @@ class GymEnv(EnvBase):
         tasks = require_all(GymTask, "tasks", tasks)
         pool = tasks if task_pool is None else require_all(GymTask, "task_pool", task_pool)
         self.pool = tuple(dict.fromkeys((*pool, *tasks)))
-        require(seed_rule(seed), _same_spaces(self.pool), *map(_repeats_rule, self.pool))
+        self._forms = {task: make_forms(task) for task in self.pool}
+        forms = []
+        for seen, taken in self._forms.values():
+            forms.append(f"{np.dtype(seen.dtype)} {list(seen.shape)} with actions {taken.form}")
+        different = ", ".join(dict.fromkeys(forms))
+        one_form = f"tasks of one environment must have observations and actions of one form, got {different}"
+        require(seed_rule(seed), (len(set(forms)) == 1, one_form), *map(_repeats_rule, self.pool))
         self.num_task_ids = require_num_ids(task_ids, num_task_ids)
         count = len(tasks)
         super().__init__(device=checked_device(device), batch_size=torch.Size([count]))
@@ -85,7 +91,6 @@ class GymEnv(EnvBase):
         self._next = tasks
         self._episode = np.full(count, -1, dtype=np.int64)
         self._actions: list[list[Any]] = [[] for _ in tasks]
-        self._forms = {task: make_forms(task) for task in self.pool}
         self._num_frames = 0
         self._envs: list[Any] = []
         self.is_closed = False
@@ -98,15 +103,15 @@ class GymEnv(EnvBase):
         rows = self.batch_size
         observed, acted = self._forms[self.pool[0]]
         shape = (*rows, *observed.shape)
-        seen: TensorSpec = Unbounded(shape=shape, dtype=torch.float32, device="cpu")
+        images: TensorSpec = Unbounded(shape=shape, dtype=torch.float32, device="cpu")
         if observed.dtype == np.uint8:
-            seen = Bounded(0, observed.largest, shape=shape, dtype=torch.uint8, device="cpu")
+            images = Bounded(0, observed.largest, shape=shape, dtype=torch.uint8, device="cpu")
         shown = not self.hides_episodes
-        self.observation_spec = observation_spec(seen, rows, self.num_task_ids, info=shown).to(self.device)
+        self.observation_spec = observation_spec(images, rows, self.num_task_ids, info=shown).to(self.device)
         self.action_spec = _make_action_spec(acted, rows).to(self.device)
         self.reward_spec = reward_spec(rows).to(self.device)
         self.full_done_spec = done_spec(rows).to(self.device)
-        every = observation_spec(seen, rows, self.num_task_ids).to(self.device)
+        every = observation_spec(images, rows, self.num_task_ids).to(self.device)
         self._data = {**every.zero(), **self.full_done_spec.zero()}
 
     def close(self, *, raise_if_closed: bool = True) -> None:
@@ -308,17 +313,6 @@ def _make_action_spec(acted: ActionForm, rows: torch.Size) -> Any:
         return Unbounded(shape=shape, dtype=torch.float32, device="cpu")
     low, high = torch.from_numpy(acted.ends).unsqueeze(1).expand(2, *shape)
     return Bounded(low, high, shape=shape, dtype=torch.float32, device="cpu")
-
-
-def _same_spaces(pool: Sequence[GymTask]) -> Rule:
-    forms = []
-    for task in pool:
-        observed, acted = make_forms(task)
-        form = f"{np.dtype(observed.dtype)} {list(observed.shape)} with actions {acted.form}"
-        if form not in forms:
-            forms.append(form)
-    rule = f"tasks of one environment must have observations and actions of one form, got {', '.join(forms)}"
-    return len(forms) == 1, rule
 
 
 def _name(task: GymTask) -> str:

@@ -39,10 +39,15 @@ def image_figure(task: Task, seed: int = 0) -> Any:
     """
     x = task.observations
     varies = x.read_noise or x.read_rotation or task.images.num_variants > 1
+    lines = []
     if varies:
-        lines = _make_varied_lines(task, seed)
+        shown: list[tuple[StateType, int]] = []
+        for kind in StateType:
+            shown += product([kind], _first_ids(task, kind, MOST_IDS))
+        for (kind, number), images in zip(shown, _reads(task, shown, COLUMNS - 1, seed), strict=True):
+            both = torch.cat([_stored(task, [number]), images])
+            lines.append(ImageLine(f"{kind.name.lower()} {number}", both, ["image", *["read"] * len(images)]))
     else:
-        lines = []
         for kind in StateType:
             ids = _first_ids(task, kind, COLUMNS)
             lines.append(ImageLine(kind.name.lower(), _stored(task, ids), list(map(str, ids))))
@@ -55,19 +60,6 @@ def image_figure(task: Task, seed: int = 0) -> Any:
     noise = f"noise 0..{x.read_noise}, rotation 0..{x.read_rotation} degrees on read"
     figure.suptitle(f"{task.images.num_images:,} images, {noise if varies else 'nothing varies on read'}", fontsize=9)
     return figure
-
-
-def _make_varied_lines(task: Task, seed: int) -> list[ImageLine]:
-    shown: list[tuple[StateType, int]] = []
-    for kind in StateType:
-        shown += product([kind], _first_ids(task, kind, MOST_IDS))
-    reads = _reads(task, shown, COLUMNS - 1, seed)
-    lines = []
-    for (kind, number), images in zip(shown, reads, strict=True):
-        label = f"{kind.name.lower()} {number}"
-        words = ["image", *["read"] * len(images)]
-        lines.append(ImageLine(label, torch.cat([_stored(task, [number]), images]), words))
-    return lines
 
 
 def _first_ids(task: Task, kind: StateType, most: int) -> list[int]:

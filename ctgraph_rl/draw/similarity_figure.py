@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -31,6 +29,7 @@ def draw_similarity(curriculum: Curriculum, path: Path | str) -> None:
     """
     if isinstance(curriculum, Stream):
         curriculum = curriculum.first(min(len(curriculum.blocks), MOST_STREAMED_TASKS))
+    labels = curriculum.labels
     tasks = ct_graphs(curriculum.tasks, "a figure of how alike tasks are")
     figure = new_figure(12, 7.6)
     figure.suptitle(f"{figure_text(curriculum.name)}: similarity of {len(tasks)} tasks")
@@ -46,18 +45,14 @@ def draw_similarity(curriculum: Curriculum, path: Path | str) -> None:
                 ink = "white" if value > 0.6 else "black"
                 number = axes.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color=ink)
                 number.set_in_layout(False)  # it is within the panel
-        _draw_labels(axes, curriculum.labels, is_lowest=axes in panels[2:], is_leftmost=axes in panels[::3])
+        if len(tasks) > MOST_LABELS:
+            axes.set(xlabel="task, from 0", ylabel="task, from 0")
+            continue
+        size = max(4, 8 - len(tasks) // 8)
+        columns = labels if axes in panels[2:] else ()
+        rows = labels if axes in panels[::3] else ()
+        axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=size)
+        axes.set_yticks(range(len(rows)), rows, fontsize=size)
     last.axis("off")
     figure.colorbar(image, ax=last, location="left", shrink=0.8, label="share; hatched: nothing to compare")
     save_figure(figure, path)
-
-
-def _draw_labels(axes: Any, labels: Sequence[str], is_lowest: bool, is_leftmost: bool) -> None:
-    if len(labels) > MOST_LABELS:
-        axes.set(xlabel="task, from 0", ylabel="task, from 0")
-        return
-    size = max(4, 8 - len(labels) // 8)
-    columns = labels if is_lowest else ()
-    rows = labels if is_leftmost else ()
-    axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=size)
-    axes.set_yticks(range(len(rows)), rows, fontsize=size)

@@ -90,7 +90,17 @@ def evaluate(
         env = make_env(curriculum, rows, seed, device)
     exploration = ExplorationType.DETERMINISTIC if greedy else ExplorationType.RANDOM
     try:
-        acts = _build_on(env, policy) if isinstance(policy, type) else as_policy(policy, num_actions(env))
+        if isinstance(policy, type):
+            known = isinstance(env, CTGraphEnv) or not issubclass(policy, RandomPolicy)
+            fix = "it knows their hidden state; give a policy of your own"
+            require((known, f"{policy.__name__} plays only CT-graphs: {fix}"))
+            try:
+                acts = policy(env)
+            except TypeError as error:
+                wanted = "policy must be a class that is built on an environment"
+                raise ValueError(f"{wanted}, got {policy!r}: {error}") from error
+        else:
+            acts = as_policy(policy, num_actions(env))
         with torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []):
             torch.manual_seed(seed)
             with set_exploration_type(exploration):
@@ -98,15 +108,6 @@ def evaluate(
     finally:
         close_env(env)
     return result.view(len(tasks), num_episodes)
-
-
-def _build_on(env: EnvBase, policy: type) -> Policy:
-    known = isinstance(env, CTGraphEnv) or not issubclass(policy, RandomPolicy)
-    require((known, f"{policy.__name__} plays only CT-graphs: it knows their hidden state; give a policy of your own"))
-    try:
-        return policy(env)
-    except TypeError as error:
-        raise ValueError(f"policy must be a class that is built on an environment, got {policy!r}: {error}") from error
 
 
 def num_actions(env: EnvBase) -> int | None:

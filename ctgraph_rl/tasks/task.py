@@ -108,21 +108,29 @@ class Task:
 
     def __post_init__(self) -> None:
         make_fields_plain(self)
-        self._check_parts()
+        images = self.images
+        pays = callable(self.reward_fn) and not isinstance(self.reward_fn, type)
+        has_images = hasattr(images, "bank") and not isinstance(images, type)
+        x = self.observations
+        require(
+            (isinstance(self.graph, CTGraph), f"graph must be a CTGraph, got {self.graph!r}"),
+            (isinstance(x, Observations), f"observations must be Observations, got {x!r}"),
+            (has_images, f"images must be an image set such as PaperImages(5), got {images!r}"),
+            (pays, f"reward_fn must be a reward such as Needle(), got {self.reward_fn!r}"),
+        )
         given = self.goal
         object.__setattr__(self, "goal", read_goal(given))
         if isinstance(self.swapped_branches, tuple):
             object.__setattr__(self, "swapped_branches", tuple(map(as_tuple, self.swapped_branches)))
-        one_hot = len(self.images.shape) == 1
-        x = self.observations
-        varies = x.read_noise or x.read_rotation or (x.reward_cue and not has_cue_element(self.images))
-        room = self.images.num_images
+        one_hot = len(images.shape) == 1
+        varies = x.read_noise or x.read_rotation or (x.reward_cue and not has_cue_element(images))
+        room = images.num_images
         last_id = x.last_id
         too_few = f"num_images={room} is too few for id {last_id} in observations: needs at least {last_id + 1}"
         require(
             self._goal_rule(given),
             self._swap_rule(),
-            *self.observations.rules(self.graph),
+            *x.rules(self.graph),
             (last_id < room, too_few),
             (
                 not (one_hot and varies),
@@ -173,19 +181,6 @@ class Task:
     def make_env(cls, tasks: Sequence[Task], seed: int = 0, **settings: Any) -> Any:
         """Return a `ctgraph_rl.CTGraphEnv` with a row per task."""
         return environment(Task)(tasks, seed, **settings)
-
-    def _check_parts(self) -> None:
-        images = self.images
-        reward_fn = self.reward_fn
-        shown = self.observations
-        has_images = hasattr(images, "bank") and not isinstance(images, type)
-        pays = callable(reward_fn) and not isinstance(reward_fn, type)
-        require(
-            (isinstance(self.graph, CTGraph), f"graph must be a CTGraph, got {self.graph!r}"),
-            (isinstance(shown, Observations), f"observations must be Observations, got {shown!r}"),
-            (has_images, f"images must be an image set such as PaperImages(5), got {images!r}"),
-            (pays, f"reward_fn must be a reward such as Needle(), got {reward_fn!r}"),
-        )
 
     def _reward_rules(self) -> list[Rule]:
         cue = self.observations.reward_cue
