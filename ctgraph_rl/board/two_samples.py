@@ -74,8 +74,8 @@ def compare_samples(submitted: Sequence[float], found: Sequence[float]) -> Diffe
         float(before.mean()),
         float(again.mean()),
         float(_p_values(before, again)),
-        low=_first(lambda drop: _p_values(before, again + drop) > ALPHA, -reach, reach),
-        high=-_first(lambda drop: _p_values(-before, drop - again) > ALPHA, -reach, reach),
+        low=find_least(lambda drop: _p_values(before, again + drop) > ALPHA, -reach, reach),
+        high=-find_least(lambda drop: _p_values(-before, drop - again) > ALPHA, -reach, reach),
         detectable=unit if math.isinf(unit) else unit * spread,
     )
 
@@ -93,7 +93,7 @@ def detectable(submitted: int, found: int) -> float:
     noise = np.random.default_rng(0).standard_normal((SAMPLES, submitted + found))
     before = noise[:, :submitted]
     again = noise[:, submitted:]
-    return _first(lambda drop: (_p_values(before, again - drop) <= ALPHA).mean() >= POWER, 0.0, 4.0, halvings=14)
+    return find_least(lambda drop: (_p_values(before, again - drop) <= ALPHA).mean() >= POWER, 0.0, 4.0, halvings=14)
 
 
 def _p_values(submitted: np.ndarray, found: np.ndarray) -> np.ndarray:
@@ -120,7 +120,8 @@ def _splits(count: int, found: int) -> np.ndarray:
     return member
 
 
-def _first(holds: Callable[[float], object], low: float, high: float, halvings: int = 40) -> float:
+def find_least(holds: Callable[[float], object], low: float, high: float, halvings: int = 40) -> float:
+    """Return by halving the least value for which something holds, as for all above; minus infinity if for ``low``."""
     if holds(low):
         return -math.inf
     for _ in range(halvings):

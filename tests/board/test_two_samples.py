@@ -22,7 +22,7 @@ def share_found(sizes: tuple[int, int], drop: float, draw) -> float:
 def test_the_stated_drop_is_found_with_the_stated_chance(sizes, monkeypatch):
     rng = np.random.default_rng(7)
     drop = detectable(*sizes)
-    monkeypatch.setattr(two_samples, "_first", lambda *_: 0.0)  # the interval takes the time
+    monkeypatch.setattr(two_samples, "find_least", lambda *_: 0.0)  # the interval takes the time
 
     assert share_found(sizes, drop, rng.standard_normal) == pytest.approx(POWER, abs=0.05)
 
@@ -30,7 +30,7 @@ def test_the_stated_drop_is_found_with_the_stated_chance(sizes, monkeypatch):
 @pytest.mark.parametrize("kind", ["normal", "two values"])
 def test_equal_distributions_are_called_different_as_seldom_as_stated(kind, monkeypatch):
     detectable(10, 3)
-    monkeypatch.setattr(two_samples, "_first", lambda *_: 0.0)
+    monkeypatch.setattr(two_samples, "find_least", lambda *_: 0.0)
     rng = np.random.default_rng(7)
     draw = rng.standard_normal if kind == "normal" else lambda shape: rng.integers(0, 2, shape).astype(float)
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
+from ctgraph_rl.board.two_samples import find_least
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.statistics import Comparison, Estimate
 from studies.raw import Raw, shown
@@ -26,8 +27,6 @@ OF_PAIRS = 0.5
 """The smallest effect on times that counts: three of four pairs are later and one is earlier."""
 
 MOST_SEEDS = 200
-STEPS = 40
-"""Halvings that find the smallest effect."""
 
 
 @dataclass(frozen=True)
@@ -82,16 +81,9 @@ class Effect:
             found = statistics.mean(moved(by), bounds=self.bounds).low
             return found is not None and found > 0
 
-        least, most = low - high, high - low
-        if len(known) < 2 or not is_seen(most):
+        if len(known) < 2 or not is_seen(high - low):
             return None
-        for _ in range(STEPS):
-            middle = (least + most) / 2
-            if is_seen(middle):
-                most = middle
-            else:
-                least = middle
-        return fmean(moved(most))
+        return fmean(moved(find_least(is_seen, low - high, high - low)))
 
     @property
     def seeds(self) -> int | None:
