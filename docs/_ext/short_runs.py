@@ -42,18 +42,6 @@ STUDIES = {
 }
 """Curricula by the page of the study that is about them."""
 
-TITLES = {
-    "baselines": "baselines",
-    "lifelong": "lifelong learning",
-    "no_labels": "learning without labels",
-    "claims": "the paper's sentences",
-    "memory": "memory cells",
-    "adaptation": "adaptation",
-    "collectives": "learners that share",
-    "plasticity": "plasticity",
-    "streams": "a life of a hundred tasks",
-}
-
 
 @cache
 def lines_of(name: str) -> dict[tuple[str, ...], Raw]:
@@ -64,7 +52,7 @@ def lines_of(name: str) -> dict[tuple[str, ...], Raw]:
 
 def study_of(name: str) -> str:
     """Return a link to the study that is about a curriculum, or nothing."""
-    links = [f"[{TITLES[page]}]({PAGE}/{page}.md)" for page, names in STUDIES.items() if name in names]
+    links = [f"[{page.replace('_', ' ')}]({PAGE}/{page}.md)" for page, names in STUDIES.items() if name in names]
     return f"Results are on the page {', '.join(links)}." if links else ""
 
 

@@ -100,7 +100,7 @@ def test_the_card_of_every_named_curriculum_has_a_line_on_results(site):
 @pytest.mark.parametrize("name", ["ct8", "fo_b2_8tasks"])
 def test_a_card_begins_its_results_with_that_line(site, name):
     card = site("curriculum_cards").card(curricula.load(name))
-    begins = {"ct8": "Results are on the page [lifelong learning]", "fo_b2_8tasks": "`agent=ppo`, 102,400 instead of "}
+    begins = {"ct8": "Results are on the page [lifelong]", "fo_b2_8tasks": "`agent=ppo`, 102,400 instead of "}
 
     assert card.split("## Results\n\n")[1].startswith(begins[name])
 

@@ -14,7 +14,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -105,11 +104,10 @@ def continued(rungs: Sequence[ladder.Rung], rows: Sequence[Mapping[str, Any]]) -
 
 
 def present_commit() -> str:
-    """Return the commit of the checkout, marked where files differ from it other than those written here."""
+    """Return the commit of the checkout, marked where other files than those written here differ from it."""
     commit = said("git", "rev-parse", "--short=12", "HEAD")
-    changed = said("git", "status", "--porcelain", "--untracked-files=no").splitlines()
-    others = [line for line in changed if Path(line[3:]).name not in (FILE.name, PAGE.name)]
-    return f"{commit}-dirty" if others else commit
+    changed = said("git", "diff", "--name-only", "HEAD", "--", ":/", f":!{FILE}", f":!{PAGE}")
+    return f"{commit}-dirty" if changed else commit
 
 
 DRIVER = ("--query-gpu=driver_version", "--format=csv,noheader")
