@@ -106,10 +106,10 @@ def continued(rungs: Sequence[ladder.Rung], rows: Sequence[Mapping[str, Any]]) -
 def present_commit() -> str:
     """Return the commit of the checkout, marked where other files than those written here differ from it."""
     commit = said("git", "rev-parse", "--short=12", "HEAD")
-    changed = said("git", "diff", "--name-only", "HEAD", "--", ":/", f":!{FILE}", f":!{PAGE}")
-    return f"{commit}-dirty" if changed else commit
+    return f"{commit}-dirty" if said("git", *CHANGED) else commit
 
 
+CHANGED = ("diff", "--name-only", "HEAD", "--", ":/", f":(exclude){FILE}", f":(exclude){PAGE}")
 DRIVER = ("--query-gpu=driver_version", "--format=csv,noheader")
 
 
