@@ -41,6 +41,7 @@ class Backpropamine(Cell):
         modulation: ``simple``, ``retroactive`` or ``none``.
     """
 
+    step_cost = 1.5
     gains_together = False  # the fast weights of several seeds leave the cache at each step
     holds = "what its units did together within an episode, in as many numbers as it has connections"
 

@@ -24,7 +24,6 @@ from curricula.paper import ct_su_b1
 
 NUMBERS = (INPUT, HISTORY, KIND)
 
-LARGEST_SHARE = merging.LARGEST_SHARE
 
 ONE, TWO = ct_su_b1((1, 2)), ct_su_b1((2, 1))
 NOISY = replace(ONE, observations=replace(ONE.observations, read_noise=10))
@@ -193,13 +192,17 @@ def test_histories_round_at_most_three_times_as_much_as_all_frames(compose, name
     require_little_rounding(exact, found, plain)
 
 
-def test_attention_whose_steps_take_longer_goes_over_fewer_histories(compose, monkeypatch):
-    monkeypatch.setattr(merging, "LARGEST_SHARE", LARGEST_SHARE)
+@pytest.mark.parametrize(("cell", "cost"), [("lstm", 1.0), ("backpropamine", 1.5), ("attention", 0.6 * 32)])
+def test_cells_whose_steps_take_longer_go_over_fewer_histories(compose, monkeypatch, cell, cost):
+    def minibatch(largest):
+        monkeypatch.setattr(merging, "LARGEST_SHARE", largest)
+        return made(compose, f"lstm_ppo {cell}", "cut episodes")[1]
 
-    of_cells = {cell: made(compose, f"lstm_ppo {cell}", "cut episodes")[1] for cell in ("lstm", "attention")}
+    history = minibatch(100.0)[HISTORY]
+    share = int(history.max()) / history.numel()
 
-    assert KIND in of_cells["lstm"]
-    assert KIND not in of_cells["attention"], "more than one history in num_frames = 32 frames"
+    assert KIND in minibatch(1.01 * cost * share)
+    assert KIND not in minibatch(0.99 * cost * share)
 
 
 def test_a_step_that_no_later_one_follows_leaves_weights_of_later_ones_as_they_are(compose):
