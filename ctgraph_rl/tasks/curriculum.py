@@ -26,6 +26,7 @@ from ctgraph_rl.checks import (
 )
 from ctgraph_rl.tasks.curriculum_json import read_curriculum, type_name, write_curriculum
 from ctgraph_rl.tasks.exactness import task_rules
+from ctgraph_rl.tasks.kinds.frozen_arguments import FrozenArguments
 from ctgraph_rl.tasks.kinds.task_like import TaskLike, are_tasks
 from ctgraph_rl.tasks.life import DrawnTasks, Lazy, Life
 from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol, count_rule
@@ -388,6 +389,8 @@ def _canonical(value: Any) -> Any:
         return found
     if isinstance(value, Iterable) and not isinstance(value, str):
         return [_canonical(item) for item in value]
+    if isinstance(value, FrozenArguments):
+        return value.pairs
     plain = value is None or isinstance(value, (bool, int, float, str))
     fix = "put @dataclass(frozen=True) above its class, whose fields then are part of the fingerprint"
     require((plain, f"a curriculum's parts must be dataclasses or plain values, got {value!r:.80}: {fix}"))

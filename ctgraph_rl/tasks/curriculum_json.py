@@ -27,7 +27,7 @@ from ctgraph_rl.core.rewards import REWARD_FNS
 from ctgraph_rl.disk import write_whole
 from ctgraph_rl.strict import json_object, require_keys, within
 from ctgraph_rl.tasks.images import IMAGE_SETS
-from ctgraph_rl.tasks.kinds.frozen_arguments import DictArgument, TupleArgument, from_json
+from ctgraph_rl.tasks.kinds.frozen_arguments import FrozenArguments, from_json
 from ctgraph_rl.tasks.kinds.gym_task import GymTask, require_wrapper_classes
 from ctgraph_rl.tasks.kinds.task_like import TaskLike, is_kind
 from ctgraph_rl.tasks.life import Life
@@ -70,7 +70,7 @@ _PARTS: dict[tuple[type, str], type] = {(Task, "graph"): CTGraph, (Task, "observ
 _OF_TASKS = ((Block, "tasks"), (Evaluation, "held_out"), (Life, "choices"))
 _OF_ARGUMENTS = ((GymTask, "kwargs"), (GymTask, "wrappers"))
 
-_NAMED_TYPES = (*chain.from_iterable(_CHOICES.values()), TupleArgument, DictArgument, Life)
+_NAMED_TYPES = (*chain.from_iterable(_CHOICES.values()), Life)
 
 _OURS = (*_NAMED_TYPES, *_PARTS.values(), Task, Block, Evaluation, Protocol)
 
@@ -162,6 +162,8 @@ def _plain(value: Any, places: Mapping[TaskLike, int]) -> Any:
         return places[value]
     if isinstance(value, tuple):
         return [_plain(item, places) for item in value]
+    if isinstance(value, FrozenArguments):
+        return value.pairs
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     kind = type(value)

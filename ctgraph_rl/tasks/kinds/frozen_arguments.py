@@ -1,52 +1,67 @@
-"""Arguments of environments and wrappers, held as frozen values that keep lists, tuples and dicts apart."""
+"""Arguments of environments and wrappers, held as a text that keeps lists, tuples and dicts apart."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from ctgraph_rl.checks import plain, require
 
+TUPLE = "TupleArgument"
 
-class ListArgument(tuple[Any, ...]):
-    """A list."""
-
-
-@dataclass(frozen=True)
-class TupleArgument:
-    """A tuple."""
-
-    items: tuple[Any, ...]
+DICT = "DictArgument"
 
 
-@dataclass(frozen=True)
-class DictArgument:
-    """A dict, as pairs in the order written."""
+class FrozenArguments(str):
+    """Arguments in the order of their names, as the JSON of pairs of name and value.
 
-    items: tuple[tuple[Any, Any], ...]
+    A tuple is an object with ``type`` and ``items``, and so is a dict, as pairs in the order written.
+    """
+
+    @property
+    def pairs(self) -> list[Any]:
+        """The pairs, as JSON."""
+        return json.loads(self)
+
+    def thaw(self) -> dict[str, Any]:
+        """Return the arguments, new lists and dicts at each call."""
+        return dict(from_json(self.pairs))
 
 
-HELD = (ListArgument, TupleArgument, DictArgument)
+NONE = FrozenArguments("[]")
 
 
-def freeze(value: Any) -> Any:
-    """Return an argument as a frozen value.
+def freeze(what: str, arguments: Any) -> FrozenArguments:
+    """Return arguments as a text.
+
+    Args:
+        what: has the arguments; begins the message.
 
     Raises:
-        ValueError: for values that JSON has no form for.
+        ValueError: for anything but arguments by name, and values that JSON has no form for.
     """
-    if isinstance(value, str):
-        return str.__str__(value)  # of an enumeration's member, as JSON has it
-    if isinstance(value, HELD) or value is None or isinstance(value, (bool, int, float)):
-        return value
+    if isinstance(arguments, FrozenArguments):
+        return arguments
+    rule = f"{what} must be plain values by name, such as {{'is_slippery': False}}, got {arguments!r:.200}"
+    try:
+        given = {name: _to_json(value) for name, value in dict(arguments).items()}
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"{rule}: {error}") from None
+    require((all(isinstance(name, str) and name for name in given), rule))
+    return FrozenArguments(json.dumps(sorted(given.items())))
+
+
+def _to_json(value: Any) -> Any:
     if isinstance(value, Mapping):
-        return DictArgument(tuple((_key(key), freeze(item)) for key, item in value.items()))
+        return {"type": DICT, "items": [[_key(key), _to_json(item)] for key, item in value.items()]}
     if isinstance(value, tuple):
-        return TupleArgument(tuple(map(freeze, value)))
+        return {"type": TUPLE, "items": list(map(_to_json, value))}
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
     listed = isinstance(value, Sequence) and not isinstance(value, (bytes, bytearray, memoryview))
     require((listed, f"{value!r:.80} is no number, text, None, list, tuple or dict"))
-    return ListArgument(map(freeze, value))
+    return list(map(_to_json, value))
 
 
 def _key(key: Any) -> Any:
@@ -56,53 +71,22 @@ def _key(key: Any) -> Any:
     return key
 
 
-def thaw(value: Any) -> Any:
-    """Return the argument of `freeze`, new lists and dicts at each call."""
-    if isinstance(value, ListArgument):
-        return [thaw(item) for item in value]
-    if isinstance(value, TupleArgument):
-        return tuple(thaw(item) for item in value.items)
-    if isinstance(value, DictArgument):
-        return {key: thaw(item) for key, item in value.items}
-    return value
-
-
 def from_json(content: Any) -> Any:
-    """Return the frozen argument of its JSON.
+    """Return the value of its JSON.
 
     Raises:
         ValueError: for an object that is no tuple and no dict.
     """
     if isinstance(content, list):
-        return ListArgument(map(from_json, content))
+        return list(map(from_json, content))
     if not isinstance(content, Mapping):
         return content
     items: Any = content.get("items")
     fits = set(content) == {"type", "items"} and isinstance(items, list)
     require((fits, f"an argument must be an object with type and items, got {content!r:.80}"))
-    if content["type"] == TupleArgument.__name__:
-        return TupleArgument(tuple(map(from_json, items)))
-    is_dict = content["type"] == DictArgument.__name__
-    require((is_dict, f"type must be TupleArgument or DictArgument, got {content['type']!r:.80}"))
+    if content["type"] == TUPLE:
+        return tuple(map(from_json, items))
+    require((content["type"] == DICT, f"type must be {TUPLE} or {DICT}, got {content['type']!r:.80}"))
     paired = all(isinstance(item, list) and len(item) == 2 for item in items)
-    require((paired, f"items of a DictArgument must be pairs, got {items!r:.80}"))
-    return DictArgument(tuple((_key(key), from_json(item)) for key, item in items))
-
-
-def by_name(what: str, arguments: Any) -> tuple[tuple[str, Any], ...]:
-    """Return arguments as pairs of name and frozen value, by name.
-
-    Args:
-        what: has the arguments; begins the message.
-
-    Raises:
-        ValueError: for anything else, and values that JSON has no form for.
-    """
-    rule = f"{what} must be plain values by name, such as {{'is_slippery': False}}, got {arguments!r:.200}"
-    try:
-        given = dict(arguments)
-        frozen = {name: freeze(value) for name, value in given.items()}
-    except (TypeError, ValueError, RecursionError) as error:
-        raise ValueError(f"{rule}: {error}") from None
-    require((all(isinstance(name, str) and name for name in frozen), rule))
-    return tuple(sorted(frozen.items()))
+    require((paired, f"items of a {DICT} must be pairs, got {items!r:.80}"))
+    return {_key(key): from_json(item) for key, item in items}

@@ -11,7 +11,7 @@ import numpy as np
 
 from ctgraph_rl.checks import as_tuple, is_int, is_real, make_fields_plain, require, true_or_false
 from ctgraph_rl.packages import load_object
-from ctgraph_rl.tasks.kinds.frozen_arguments import by_name, thaw
+from ctgraph_rl.tasks.kinds.frozen_arguments import NONE, freeze
 from ctgraph_rl.tasks.kinds.gym_spaces import ActionForm, ObservationForm
 from ctgraph_rl.tasks.kinds.task_like import close_env, environment
 
@@ -31,7 +31,7 @@ ALREADY = {
 """Arguments of ``gymnasium.make`` that ``kwargs`` cannot give, and why."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class GymTask:
     """An environment of Gymnasium with a time limit, and images, vectors or integers as observations.
 
@@ -66,7 +66,7 @@ class GymTask:
     """
 
     id: str
-    kwargs: Any = ()  # held as pairs in the order of their names, see `ctgraph_rl.tasks.kinds.frozen_arguments`
+    kwargs: Any = NONE  # held as `ctgraph_rl.tasks.kinds.frozen_arguments.FrozenArguments`
     wrappers: Any = ()  # held as a tuple of names, and of pairs of a name and arguments
     max_episode_steps: int | None = None
     label: str | None = None
@@ -76,7 +76,7 @@ class GymTask:
 
     def __post_init__(self) -> None:
         make_fields_plain(self)
-        object.__setattr__(self, "kwargs", by_name("kwargs", self.kwargs))
+        object.__setattr__(self, "kwargs", freeze("kwargs", self.kwargs))
         wrappers = as_tuple(self.wrappers)
         form = "[FlattenObservation, 'my_module:MyWrapper', (FrameStackObservation, {'stack_size': 4})]"
         rule = f"wrappers must be a list of classes, functions or their names, such as {form}, got {self.wrappers!r}"
@@ -85,7 +85,7 @@ class GymTask:
         limit = self.max_episode_steps
         pair = self.return_range
         in_order = isinstance(pair, tuple) and len(pair) == 2 and is_real(pair[0]) and is_real(pair[1], pair[0])
-        arguments = dict(self.kwargs)
+        arguments = self.kwargs.thaw()
         human = "render_mode must be 'rgb_array', which AddRenderObservation shows, or left out: 'human' opens windows"
         channels = f"channels must be 'first', 'last' or None, got {self.channels!r}"
         require(
@@ -98,20 +98,12 @@ class GymTask:
             (self.channels in (None, "first", "last"), channels),
             *true_or_false(repeats=self.repeats),
         )
-        plain = (self.id, self.max_episode_steps, self.label, self.return_range, self.repeats, self.channels)
-        object.__setattr__(self, "_key", (*plain, repr(self.kwargs), repr(self.wrappers)))
-
-    def __eq__(self, other: object) -> bool:
-        return self._key == other._key if type(other) is type(self) else NotImplemented  # type: ignore[attr-defined]
-
-    def __hash__(self) -> int:
-        return hash(self._key)  # type: ignore[attr-defined]
 
     @property
     def label_parts(self) -> dict[str, str]:
         """One part: the label."""
         kinds = (bool, int, float, str, type(None))
-        given = [f"{name}={value}" for name, value in self.kwargs if isinstance(value, kinds)]
+        given = [f"{name}={value}" for name, value in self.kwargs.thaw().items() if isinstance(value, kinds)]
         return {"task": self.label or " ".join([self.id, *given])}
 
     @property
@@ -154,14 +146,13 @@ class GymTask:
         """
         import gymnasium
 
-        kwargs = {name: thaw(value) for name, value in self.kwargs}
         env: Any = None
         try:
             try:
-                env = gymnasium.make(self.id, self.max_episode_steps, disable_env_checker=True, **kwargs)
+                env = gymnasium.make(self.id, self.max_episode_steps, disable_env_checker=True, **self.kwargs.thaw())
                 for wrapper in self.wrappers:
-                    name, arguments = (wrapper, ()) if isinstance(wrapper, str) else wrapper
-                    wrapped = load_object(name)(env, **{key: thaw(value) for key, value in arguments})
+                    name, arguments = (wrapper, NONE) if isinstance(wrapper, str) else wrapper
+                    wrapped = load_object(name)(env, **arguments.thaw())
                     is_env = isinstance(wrapped, gymnasium.Env)
                     require((is_env, f"the wrapper {name} must return a gymnasium.Env, got {wrapped!r:.80}"))
                     env = wrapped
@@ -312,8 +303,8 @@ def _frozen_wrapper(wrapper: Any, rule: str) -> Any:
     found = not {"<lambda>", "<locals>"} & set(name.replace(":", ".").split("."))
     fix = "define it by class or def at the top of a module"
     require((found, f"the wrapper {name} has no name by which another process finds it, got {wrapper!r}: {fix}"))
-    arguments = by_name(f"arguments of the wrapper {name}", given)
-    return (name, arguments) if arguments else name
+    arguments = freeze(f"arguments of the wrapper {name}", given)
+    return name if arguments == NONE else (name, arguments)
 
 
 def require_wrapper_classes(task: GymTask) -> None:
