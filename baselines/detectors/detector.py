@@ -359,9 +359,8 @@ class SelfLabelledAgent(nn.Module):
             self.learner.start_task(self.label)
             self.detector.start_label(self.label, trial=True)
         else:
-            self._accept(
-                self.num_labels if self.num_labels < cast(int, self.detector.max_labels) else cast(int, self.home)
-            )
+            most = cast(int, self.detector.max_labels)
+            self._accept(self.num_labels if self.num_labels < most else cast(int, self.home))
 
     def _accept(self, label: int) -> None:
         if label == self.home and self.snapshots:
