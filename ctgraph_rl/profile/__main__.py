@@ -42,8 +42,8 @@ def main() -> None:
         if arguments.config_dir is not None:
             for problem in import_agents(arguments.config_dir):
                 print_note("left out", problem)
-        scores = write_profile(folders, out, arguments.agent)
-    runs, problems = find_runs(folders)
+        runs, problems = find_runs(folders)
+        scores = write_profile(runs, problems, out, arguments.agent)
     complete = not print_problems(problems, runs) and complete
     print(terminal_lines(text_table(scores)))
     print(f"profile: {terminal_text(out / 'profile.md')}")

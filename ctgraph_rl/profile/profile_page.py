@@ -15,6 +15,7 @@ from ctgraph_rl.profile.scoring import Profiles, profile_scores
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, Gallery, left_out
 from ctgraph_rl.report.latex import Table, as_cell, document
 from ctgraph_rl.report.style import MOST_AGENTS, WIDTH, agent_style, new_figure, require_packages, short
+from ctgraph_rl.runs.read import Problem, Run
 
 MEANING = (
     "A score is 0 at the floor of an agent without the property and 1 at the optimum. Intervals are at 95 % over all "
@@ -24,7 +25,9 @@ MEANING = (
 COLUMNS = ("agent", "property", "score", "low", "high", "n", "reason", "measured", "floor", "optimum", "controls")
 
 
-def write_profile(paths: Sequence[Path | str], folder: Path | str, agents: Sequence[str] = ()) -> Profiles:
+def write_profile(
+    runs: Sequence[Run], problems: Sequence[Problem], folder: Path, agents: Sequence[str] = ()
+) -> Profiles:
     """Write ``profile.md`` with its figure, ``profile.csv`` and ``profile.tex``; return `profile_scores`.
 
     Raises:
@@ -33,7 +36,7 @@ def write_profile(paths: Sequence[Path | str], folder: Path | str, agents: Seque
         BlockingIOError: if another process writes into the folder.
     """
     require_packages()
-    scores = profile_scores(paths, agents)
+    scores = profile_scores(runs, problems, agents)
     titles = list(next(iter(scores.values())))
     rows: list[Sequence[Any]] = [COLUMNS]
     cells = []
@@ -48,8 +51,7 @@ def write_profile(paths: Sequence[Path | str], folder: Path | str, agents: Seque
     shown = [[title, *(str(of_agent[title]) for of_agent in scores.values())] for title in titles]
     measured = [[title, *(of_agent[title].absolute for of_agent in scores.values())] for title in titles]
     table = Table(f"Profile. {MEANING}", "profile", "agent", titles, cells)
-    folder = make_folder(Path(folder))
-    with locked(folder):
+    with locked(make_folder(folder)):
         write_whole(folder / "profile.csv", csv_text(rows))
         write_whole(folder / "profile.tex", document([table]) + "\n")
         [drawn] = Gallery(folder).write((), _figures(scores))  # which draws them in the report's style

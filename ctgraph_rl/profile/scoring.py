@@ -24,7 +24,7 @@ from ctgraph_rl.packages import check_packages, class_named
 from ctgraph_rl.profile.properties import Evidence, Measured, measure
 from ctgraph_rl.report.intervals import Bounds, gaffke
 from ctgraph_rl.report.names import displayed
-from ctgraph_rl.runs.read import MODIFIED, Run, find_runs, grouped, present, why_left_out
+from ctgraph_rl.runs.read import MODIFIED, Problem, Run, grouped, present, why_left_out
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 LEVEL = 0.95
@@ -67,25 +67,26 @@ Profiles = Mapping[str, Mapping[str, Score]]
 """For each agent the scores by the properties' titles, in the paper's order."""
 
 
-def score_of(results: Sequence[Measured], controls: Sequence[str] = ()) -> Score:
+def score_of(results: Sequence[Measured], controls: Sequence[str] = (), reason: str = "") -> Score:
     """Return the mean of value - floor over the mean of optimum - floor, within [0, 1], with a 95 % interval.
 
     A seed without room adds value - floor to the first mean and 0 to the second. The floor is that of the control with
-    the best mean.
+    the best mean. A gap where there is no result, or the controls leave no room.
 
     Args:
-        results: one for each seed, at least one.
+        results: one for each seed.
         controls: the curricula that floors were measured on.
-
-    Raises:
-        Undefined: where the controls leave no room.
+        reason: of a gap, or what is special about the results.
     """
+    if not results:
+        return Score(None, reason=reason)
     means = [fmean(floors) for floors in zip(*(each.floors for each in results), strict=True)]
     floor = max(means)
     measured = fmean(each.value for each in results)
     optimum = fmean(each.optimum for each in results)
     if optimum - floor <= 0:
-        raise Undefined(f"{controls[means.index(floor)] if controls else 'the floor'} leaves no room")
+        no_room = f"{controls[means.index(floor)] if controls else 'the floor'} leaves no room"
+        return Score(None, reason=f"{reason}: {no_room}" if reason else no_room)
     value = min(max((measured - floor) / (optimum - floor), 0.0), 1.0)
     low = high = None
     if len(results) > 1:
@@ -98,7 +99,7 @@ def score_of(results: Sequence[Measured], controls: Sequence[str] = ()) -> Score
         low = min(max(found[0], 0.0), value)
         high = max(min(found[1], 1.0), value)
     said = ", ".join(f"{name} {mean:.2f}" for name, mean in zip(controls, means, strict=False))
-    return Score(value, low, high, len(results), measured=measured, floor=floor, optimum=optimum, controls=said)
+    return Score(value, low, high, len(results), reason, measured=measured, floor=floor, optimum=optimum, controls=said)
 
 
 def _paired_interval(results: Sequence[Measured]) -> tuple[float, float]:
@@ -141,22 +142,20 @@ def _highest(pairs: Sequence[tuple[float, float]], holds: Callable[[tuple[float,
     return low
 
 
-class Results(NamedTuple):
-    """What an agent's seeds measured of a property; without any, the reason."""
-
-    seeds: Mapping[int, Measured]
-    reason: str = ""
-    controls: tuple[str, ...] = ()
+RunsByName = dict[str, dict[int, Run]]
 
 
-def profile_scores(paths: Sequence[Path | str], agents: Sequence[str] = ()) -> dict[str, dict[str, Score]]:
-    """Return the scores of all agents with runs of profile curricula in or below some folders.
+def profile_scores(
+    runs: Sequence[Run], problems: Sequence[Problem], agents: Sequence[str] = ()
+) -> dict[str, dict[str, Score]]:
+    """Return the scores of all agents with runs of profile curricula.
 
     A property counts all seeds of an agent or none. It has a gap where a run is unfinished, lacks a control of the same
     seed, or was evaluated at other moments than its curriculum says. The reason names the run and a command.
 
     Args:
-        paths: folders of runs, of ``ctgraph-rl profile`` or of a `ctgraph_rl.Recorder`.
+        runs: of ``ctgraph-rl profile`` or of a `ctgraph_rl.Recorder`.
+        problems: as `find_runs` returns them.
 
     Returns:
         For each agent its score by the title of each property. A modified curriculum counts where the published one has
@@ -170,12 +169,12 @@ def profile_scores(paths: Sequence[Path | str], agents: Sequence[str] = ()) -> d
     names = {*properties}
     for prop in properties.values():
         names.update(prop.controls)
-    runs, problems = find_runs(paths)
-    runs = [run for run in runs if run.group[0] in names]
-    none = f"no run of a profile in {', '.join(map(str, paths))}: learn curriculum={next(iter(properties))}"
-    require((bool(runs), why_left_out(problems) or none))
+    own = [run for run in runs if run.group[0] in names]
+    others = ", ".join(sorted({run.group[0] for run in runs}))
+    none = f"no run of a profile, only of {others}: learn curriculum={next(iter(properties))}"
+    require((bool(own), why_left_out(problems) or none))
     of_agents: dict[str, dict[bool, RunsByName]] = {}
-    for (curriculum, agent), by_seed in grouped(displayed(runs, agents)).items():
+    for (curriculum, agent), by_seed in grouped(displayed(own, agents)).items():
         kinds = of_agents.setdefault(agent, {False: {}, True: {}})
         for run in present(by_seed):
             kinds[MODIFIED in curriculum].setdefault(run.group[0], {})[run.seed] = run
@@ -185,39 +184,26 @@ def profile_scores(paths: Sequence[Path | str], agents: Sequence[str] = ()) -> d
         scores[agent] = {}
         for name, prop in properties.items():
             began = [problem.reason for problem in problems if problem.path.parent.name == name]
-            scores[agent][prop.title] = score_of_results(_results(kinds, name, prop, read, began))
+            scores[agent][prop.title] = _score(kinds, name, prop, read, began)
     return scores
 
 
-def score_of_results(results: Results) -> Score:
-    """Return `score_of` the results, or a gap with its reason."""
-    if not results.seeds:
-        return Score(None, reason=results.reason)
-    try:
-        return score_of(list(results.seeds.values()), results.controls)._replace(reason=results.reason)
-    except Undefined as error:
-        return Score(None, reason=": ".join(filter(None, [results.reason, str(error)])))
-
-
-RunsByName = dict[str, dict[int, Run]]
-
-
-def _results(
+def _score(
     kinds: Mapping[bool, RunsByName], name: str, prop: Any, read: dict[Path, Evidence], began: Sequence[str]
-) -> Results:
+) -> Score:
     gaps = []
     for is_modified, runs in kinds.items():
         said = f"of {name}{MODIFIED}" if is_modified else ""
         if name in runs:
             try:
-                return Results(_over_seeds(runs, name, prop, read), said, prop.controls)
+                return score_of(_over_seeds(runs, name, prop, read), prop.controls, said)
             except Undefined as error:
-                gaps.append(": ".join(filter(None, [said, str(error)])))
-    return Results({}, next(iter([*gaps, *began]), "there is no run"))
+                gaps.append(f"{said}: {error}" if said else str(error))
+    return Score(None, reason=next(iter([*gaps, *began]), "there is no run"))
 
 
-def _over_seeds(runs: RunsByName, name: str, prop: Any, read: dict[Path, Evidence]) -> dict[int, Measured]:
-    results = {}
+def _over_seeds(runs: RunsByName, name: str, prop: Any, read: dict[Path, Evidence]) -> list[Measured]:
+    results = []
     for seed, run in sorted(runs[name].items()):
         needed = []
         for control in prop.controls:
@@ -233,7 +219,7 @@ def _over_seeds(runs: RunsByName, name: str, prop: Any, read: dict[Path, Evidenc
             raise Undefined(f"{run.path}: {error}") from error
         if not all(map(math.isfinite, (measured.value, *measured.floors))):
             raise Undefined(f"{run.path}: an evaluation has no mean return")
-        results[seed] = measured
+        results.append(measured)
     return results
 
 
@@ -257,24 +243,17 @@ def _evidence(run: Run) -> Evidence:
             f"{published.version}: train it again in another folder"
         )
     log = RunLog.read(run.path / LOG)
-    lacking = _lacking(log, learned)
-    if lacking:
-        raise Undefined(f"{run.path} {lacking}: {_command(run)} overwrite=true")
-    return Evidence(log, learned, run.path, _agent_class(run))
-
-
-def _lacking(log: RunLog, curriculum: Curriculum) -> str:
-    evaluator = Evaluator(curriculum, 0, RunLog())
+    evaluator = Evaluator(learned, 0, RunLog())
     due: Counter[tuple[int, int]] = Counter()
-    for frames in curriculum.moments:
-        for number, _ in evaluator.tasks_at(frames).values():
-            due[frames, number] += 1
+    for frames in learned.moments:
+        due.update((frames, number) for number, _ in evaluator.tasks_at(frames).values())
     made = Counter((m["frames"], m["task"]) for m in log.of_kind("evaluation"))
     for word, others in (("lacks the evaluation", due - made), ("has one evaluation too many", made - due)):
         if others:
             frames, number = min(others)
-            return f"{word} of task {number} after {frames:,} frames"
-    return ""
+            what = f"{run.path} {word} of task {number} after {frames:,} frames"
+            raise Undefined(f"{what}: {_command(run)} overwrite=true")
+    return Evidence(log, learned, run.path, _agent_class(run))
 
 
 def _command(run: Run, curriculum: str = "") -> str:

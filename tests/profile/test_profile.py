@@ -21,6 +21,7 @@ from ctgraph_rl.metrics import Undefined
 from ctgraph_rl.profile.profile_page import write_profile
 from ctgraph_rl.profile.properties import Measured, measure
 from ctgraph_rl.profile.scoring import profile_scores, rest_of_gain, score_of
+from ctgraph_rl.runs.read import find_runs
 from curricula.profile import NAMED, PROPERTIES, TARGETS
 
 LIVES = ("profile_fresh", "profile_unrelated", "profile_similarity", "profile_dissimilar", "profile_hierarchy")
@@ -171,7 +172,7 @@ def test_goals_of_a_depth_take_each_branch_equally_often_at_each_place(name):
 def test_a_recorded_run_is_scored_and_what_was_not_run_is_a_gap(tmp_path):
     record(tmp_path / "mine", "profile_attention")
 
-    scores = profile_scores([tmp_path])["Mine"]
+    scores = profile_scores(*find_runs([tmp_path]))["Mine"]
 
     assert (scores["attention"].value, scores["attention"].measured, scores["attention"].floor) == (0, 0, 0.25)
     assert (scores["memory"].value, scores["memory"].reason) == (None, "there is no run")
@@ -186,7 +187,7 @@ def test_a_modified_curriculum_counts_where_the_published_one_has_no_score(tmp_p
     reasons = []
     for other in ("begun", "published"):
         folders = [tmp_path / "modified", tmp_path / other]
-        reasons.append(profile_scores(folders[::order])["Mine"]["attention"].reason)
+        reasons.append(profile_scores(*find_runs(folders[::order]))["Mine"]["attention"].reason)
     assert reasons == ["of profile_attention (modified)", ""]
 
 
@@ -194,7 +195,7 @@ def test_a_seed_that_is_not_finished_leaves_a_gap_that_names_it_and_what_gives_i
     record(tmp_path / "whole", "profile_adaptation")
     record(tmp_path / "half", "profile_adaptation", moments=(8192, 16384), seed=1)
 
-    score = profile_scores([tmp_path])["Mine"]["adaptation"]
+    score = profile_scores(*find_runs([tmp_path]))["Mine"]["adaptation"]
 
     assert score.value is None
     assert f"{tmp_path / 'half'} has no results, unfinished" in score.reason
@@ -205,7 +206,7 @@ def test_blocks_that_were_evaluated_unequally_often_are_not_compared(tmp_path):
     curriculum = curricula.load("profile_adaptation")
     record(tmp_path / "uneven", "profile_adaptation", moments=(*curriculum.moments[:4], *curriculum.ends))
 
-    score = profile_scores([tmp_path])["Mine"]["adaptation"]
+    score = profile_scores(*find_runs([tmp_path]))["Mine"]["adaptation"]
 
     assert score.value is None
     assert "uneven lacks the evaluation of task 1 after 49,152 frames" in score.reason
@@ -215,7 +216,7 @@ def test_an_evaluation_too_many_is_named_too(tmp_path):
     curriculum = curricula.load("profile_adaptation")
     record(tmp_path / "uneven", "profile_adaptation", moments=(2048, *curriculum.moments))
 
-    score = profile_scores([tmp_path])["Mine"]["adaptation"]
+    score = profile_scores(*find_runs([tmp_path]))["Mine"]["adaptation"]
 
     assert score.value is None
     assert "has one evaluation too many of task 1 after 2,048 frames" in score.reason
@@ -225,9 +226,9 @@ def test_a_life_without_its_control_is_a_gap(tmp_path):
     for name in ("profile_fresh", "profile_dissimilar", "profile_similarity"):
         record(tmp_path / name, name)
 
-    whole = profile_scores([tmp_path])["Mine"]["similarity"]
+    whole = profile_scores(*find_runs([tmp_path]))["Mine"]["similarity"]
     record(tmp_path / "more", "profile_similarity", seed=1)
-    lacking = profile_scores([tmp_path])["Mine"]["similarity"]
+    lacking = profile_scores(*find_runs([tmp_path]))["Mine"]["similarity"]
 
     assert (whole.value, whole.n) == (0, 1)
     assert whole.controls == "profile_fresh 0.00, profile_dissimilar 0.00"
@@ -246,7 +247,7 @@ def test_a_run_of_an_earlier_version_is_not_scored(tmp_path):
     first.to_json(file)
     log.write_text(log.read_text(encoding="utf-8").replace(old.fingerprint, first.fingerprint), encoding="utf-8")
 
-    reason = profile_scores([tmp_path])["Mine"]["attention"].reason
+    reason = profile_scores(*find_runs([tmp_path]))["Mine"]["attention"].reason
 
     assert content["version"] == 2
     assert "learned version 1 of profile_attention, the profile has version 2" in reason
@@ -265,7 +266,7 @@ def test_the_page_has_scores_and_what_was_measured_side_by_side(tmp_path):
     pytest.importorskip("matplotlib")
     record(tmp_path / "runs" / "mine", "profile_attention")
 
-    write_profile([tmp_path / "runs"], tmp_path / "out")
+    write_profile(*find_runs([tmp_path / "runs"]), tmp_path / "out")
 
     page = (tmp_path / "out" / "profile.md").read_text(encoding="utf-8")
     assert "| attention | 0.00 |" in page

@@ -38,7 +38,7 @@ WRITERS: dict[str, Callable[..., object]] = {
     "Recorder": lambda folder, compose: Recorder(TASKS, folder),
     "Recorder that resumes": lambda folder, compose: Recorder(TASKS, folder, resume=True),
     "Recorder that replaces": lambda folder, compose: Recorder(TASKS, folder, overwrite=True),
-    "profile": lambda folder, compose: profile_page.write_profile([], folder),
+    "profile": lambda folder, compose: profile_page.write_profile([], [], folder),
     "page on collectives": lambda folder, compose: page_on_collectives.write_report([], folder),
     "report": lambda folder, compose: write_report([make_run(folder.parent, 0)], folder),
 }

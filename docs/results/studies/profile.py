@@ -9,7 +9,7 @@ import curricula
 from ctgraph_rl.draw.style import save_figure
 from ctgraph_rl.profile.profile_page import draw_profiles
 from ctgraph_rl.profile.properties import Measured
-from ctgraph_rl.profile.scoring import Results, Score, score_of_results
+from ctgraph_rl.profile.scoring import Score, score_of
 from ctgraph_rl.report.style import style
 from curricula.profile import PROPERTIES
 from studies.raw import Raw, fill, groups, machines, read, select, table
@@ -37,13 +37,13 @@ def scores(lines: Raw | None = None) -> dict[str, dict[str, Score]]:
         found[agent] = {}
         for prop in PROPERTIES.values():
             of = by_agent[agent, prop.title]
-            seeds = {}
+            seeds = []
             for line in of:
                 if line["value"]:
                     floors = tuple(map(float, line["floors"].split()))
                     own = (float(line["value"]), floors, float(line["optimum"]), float(line["highest"]))
-                    seeds[int(line["seed"])] = Measured(*own, exact=not prop.controls)
-            found[agent][prop.title] = score_of_results(Results(seeds, of[0]["reason"], prop.controls))
+                    seeds.append(Measured(*own, exact=not prop.controls))
+            found[agent][prop.title] = score_of(seeds, prop.controls, of[0]["reason"])
     return found
 
 
