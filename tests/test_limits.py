@@ -19,9 +19,8 @@ from helpers.stopped_runs import with_header
 
 import curricula
 from ctgraph_rl import Curriculum, RunLog, Task, strict
-from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.saved import read_plain
-from ctgraph_rl.log.sums import write_metrics
+from ctgraph_rl.log.sums import damaged, write_metrics
 from ctgraph_rl.log.tables import write_tables
 from ctgraph_rl.runs.checkpoints import BrokenCheckpoint, decoded
 from ctgraph_rl.runs.read import find_runs

@@ -17,10 +17,9 @@ from helpers.sweeping import command_line, files_in
 import curricula
 from baselines.lstm_ppo import LSTMPPO
 from ctgraph_rl import Block, CTGraphEnv, Curriculum, Protocol, RunLog, evaluate, learn_curriculum, packages
-from ctgraph_rl.log.damage import metrics_of
 from ctgraph_rl.log.provenance import NUMBERS, name_in_logs
 from ctgraph_rl.log.saved import without_moments
-from ctgraph_rl.log.sums import RESULTS
+from ctgraph_rl.log.sums import RESULTS, metrics_of
 from ctgraph_rl.metrics import definitions
 from ctgraph_rl.run import run
 from ctgraph_rl.runs import job

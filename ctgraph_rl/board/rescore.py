@@ -119,7 +119,7 @@ def _rules(what: str, rules: Sequence[Rule], expected: str, found: str) -> Check
 
 
 def _of_the_log(submission: Submission, run: SubmittedRun, log: RunLog) -> Iterator[Check]:
-    about = (log.of_kind("run") or [{}])[0]
+    about = log.about
     config = dict(about.get("config") or {})
     seed = config.pop("seed", None)
     changed = listed(differences(config, submission.config))

@@ -27,13 +27,13 @@ from ctgraph_rl.board.submission import (
 from ctgraph_rl.board.tracks import Track, track
 from ctgraph_rl.checks import ReadOnlyValues, Rule, require
 from ctgraph_rl.disk import make_folder, new_folder, require_new, write_whole
-from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.escape import listed, refused_by, terminal_text
 from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG, locked_new
 from ctgraph_rl.log.provenance import NUMBERS, code_changes
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.saved import count_bytes, read_content, read_plain, sum_of_state
 from ctgraph_rl.log.sources import SCRIPTS, find_sources
+from ctgraph_rl.log.sums import damaged
 from ctgraph_rl.runs.read import Run, find_runs, why_left_out
 from ctgraph_rl.runs.settings import flat
 from ctgraph_rl.tasks.curriculum import Curriculum

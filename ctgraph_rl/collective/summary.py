@@ -109,7 +109,7 @@ def read_collective(path: Path | str) -> Collective:
 
 def _learned(path: Path, number: int, about: ReadOnlyValues) -> Iterator[Learned]:
     log = RunLog.read(member_folder(path, number) / LOG)
-    trained = log.of_kind("run")[0]["trained"]
+    trained = log.about["trained"]
     start = 0
     for block, own in sorted(split_by(log.of_kind("training"), lambda line: line["block"]).items()):
         returns = []

@@ -35,9 +35,8 @@ def life_inputs(log: RunLog, stream: Stream) -> NamedValues:
 
     An unfinished run gives none, and a tuning run those of the whole blocks of its part.
     """
-    reached = max((m["frames"] for m in log.of_kind("evaluation")), default=0)
-    done = reached // stream.blocks.num_frames
-    share = next(map(tuning_share, log.of_kind("run")), None)
+    done = log.reached("evaluation") // stream.blocks.num_frames
+    share = tuning_share(log.about)
     needed = len(stream.blocks) if share is None else min(done, stream.frames_of(share) // stream.blocks.num_frames)
     if done < needed or not needed:
         reason = Undefined(f"the run is not finished: it ended block {done:,} of {max(needed, 1):,}")
@@ -132,7 +131,7 @@ def by_windows(log: RunLog) -> RunLog:
             training.setdefault(m["block"], []).append(m)
         elif m["kind"] == "evaluation" and m.get("moment") != "during":
             ends.setdefault(m["block"], m)  # the first of a block is of the task that it trains
-    about = log.of_kind("run")[0]
+    about = log.about
     count = about["life"] if tuning_share(about) is None else max(ends, default=0)
     blocks = torch.arange(1, max(count, 1) + 1, device="cpu")
     windows = [window.tolist() for window in blocks.tensor_split(min(NUM_WINDOWS, len(blocks)))]

@@ -39,7 +39,7 @@ from torch import Tensor
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, as_path, is_real, require
 from ctgraph_rl.disk import appending, cannot_write, open_own, read_regular
 from ctgraph_rl.log.measurement import check, parsed
-from ctgraph_rl.metrics import Column, Curves, Regime, RegimeTable, Trained
+from ctgraph_rl.metrics import Curves, RegimeTable, Trained
 from ctgraph_rl.metrics.adaptation import Adaptation
 
 MOST_CELLS = 10**7
@@ -99,9 +99,14 @@ class RunLog:
         return f"<RunLog {run['curriculum']!s:.80}, seed {run['seed']}: {counts}>"
 
     def _run(self) -> NamedValues:
-        about = (self.of_kind("run") or [{}])[0]
+        about = self.about
         seed = (about.get("config") or {}).get("seed")
         return {"curriculum": about.get("curriculum"), "fingerprint": about.get("fingerprint"), "seed": seed}
+
+    @property
+    def about(self) -> NamedValues:
+        """The first line; empty without."""
+        return next(iter(self.of_kind("run")), {})
 
     @classmethod
     def resume(cls, path: Path | str, position: Mapping[str, float]) -> RunLog:
@@ -208,10 +213,9 @@ class RunLog:
             except ValueError as error:
                 raise ValueError(f"{path}: line {number}: {error}: {BROKEN}") from None
             log.measurements.append(measurement)
-        for run in log.of_kind("run"):
-            schema = run.get("schema", SCHEMA)
-            newer = f"{path} has schema {schema}, this version reads {SCHEMA}: update ctgraph_rl"
-            require((schema <= SCHEMA, newer))
+        schema = log.about.get("schema", SCHEMA)
+        newer = f"{path} has schema {schema}, this version reads {SCHEMA}: update ctgraph_rl"
+        require((schema <= SCHEMA, newer))
         return log
 
     @classmethod
@@ -273,12 +277,14 @@ class RunLog:
 
     def labels(self, count: int) -> tuple[str, ...]:
         """The labels of the first tasks, such as the columns of `performance`."""
-        known: dict[int, str] = {}
-        for run in self.of_kind("run"):
-            known |= dict(enumerate(map(str, run.get("tasks") or ()), 1))
+        known = dict(enumerate(map(str, self.about.get("tasks") or ()), 1))
         for m in self._evaluations(during=True):
             known[m["task"]] = label_of(m)
         return tuple(known.get(task, f"task {task}") for task in range(1, count + 1))
+
+    def reached(self, kind: str) -> int:
+        """Frames of the run at the last measurement of a kind; 0 without."""
+        return max((m["frames"] for m in self.of_kind(kind)), default=0)
 
     def ends(self) -> list[int]:
         """Frames of the run at the end of each block so far; 0 for block 0."""
@@ -288,9 +294,9 @@ class RunLog:
                 ends[m["block"]] = m["frames"]
         return [ends.get(block, 0) for block in range(max(ends) + 1)]
 
-    def training(self, name: str, block: int | None = None) -> Tensor:
-        """A field of the training intervals of one block or all, float64 [intervals]; NaN for null."""
-        return _row([m.get(name) for m in self.of_kind("training") if block in (None, m["block"])])
+    def training(self, name: str) -> Tensor:
+        """A field of all training intervals, float64 [intervals]; NaN for null."""
+        return _row([m.get(name) for m in self.of_kind("training")])
 
     def training_by_block(self, name: str) -> dict[int, Tensor]:
         """`training` of each block that has intervals, by its number."""
@@ -349,11 +355,7 @@ class RunLog:
         num_tasks = 1 + max(chain(*of_blocks))
         return Curves(self._matrix(points.values(), num_tasks), blocks, frames, of_blocks)
 
-    def regimes(self, trained: Trained | None = None) -> list[Regime]:
-        """Return `regime_table` as a list of regimes."""
-        return list(self.regime_table(trained))
-
-    def regime_table(self, trained: Trained | None = None, labels: Sequence[str] | None = None) -> RegimeTable:
+    def regimes(self, trained: Trained | None = None, labels: Sequence[str] | None = None) -> RegimeTable:
         """The run as the lifelong metrics see it: a regime per training block and per evaluation at its boundaries.
 
         An experience is a training interval with finished episodes. Evaluations during blocks or held out do not count.
@@ -383,7 +385,7 @@ class RunLog:
         for task, training, own in self._stays(tasks):
             rows.append((names.setdefault(label[task], len(names)), training, len(own)))
             values += own
-        return RegimeTable([*names], Column(*zip(*rows, strict=True)), _row(values))
+        return RegimeTable(names, *zip(*rows, strict=True), values=_row(values))
 
     def _stays(self, tasks: Sequence[int]) -> Iterator[tuple[int, bool, list[float | None]]]:
         at_end: dict[int, list[NamedValues]] = {}
@@ -404,10 +406,7 @@ class RunLog:
         return tuple(map(tuple, trained))
 
     def _said(self) -> list[list[int]]:
-        for run in self.of_kind("run"):
-            if "trained" in run:
-                return [[number - 1 for number in block] for block in run["trained"]]
-        return []
+        return [[number - 1 for number in block] for block in self.about.get("trained", ())]
 
     def _evaluations(self, during: bool) -> list[NamedValues]:
         found = []

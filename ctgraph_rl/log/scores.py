@@ -76,10 +76,9 @@ def inputs_of(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | N
     An unfinished run has measured nothing, a tuning run only `OF_A_PART`.
     """
     facts = _facts(curriculum)
-    share = next(map(tuning_share, log.of_kind("run")), None)
+    share = tuning_share(log.about)
     if share is not None and share < 1:
-        reached = max((m["frames"] for m in log.of_kind("training")), default=0)
-        ended = f"a tuning run, which ended after {reached:,} of {curriculum.num_frames:,} frames"
+        ended = f"a tuning run, which ended after {log.reached('training'):,} of {curriculum.num_frames:,} frames"
         reason = Undefined(f"{ended}, has only metrics of training")
         found = _training(log, curriculum, facts["best"], curriculum.frames_of(share))
         known = {name: found[name] for name in OF_A_PART if name in found}
@@ -97,7 +96,7 @@ def check_finished(log: RunLog, curriculum: Curriculum) -> None:
     Raises:
         ctgraph_rl.metrics.Undefined: says how far it came.
     """
-    reached = max((m["frames"] for m in log.of_kind("evaluation")), default=0)
+    reached = log.reached("evaluation")
     last = curriculum.moments[-1]
     if reached < last:
         raise Undefined(f"the run is not finished: its last evaluation is after {reached:,} of {last:,} frames")
@@ -187,15 +186,22 @@ OF_TRAINING = (
 
 
 def _training(log: RunLog, curriculum: Curriculum, best: Tensor | Undefined, last: int) -> NamedValues:
-    reached = max((m["frames"] for m in log.of_kind("training")), default=0)
+    reached = log.reached("training")
     if 0 < reached < last:
         reason = Undefined(f"training is logged up to {reached:,} of {last:,} frames: log it to the end")
         return dict.fromkeys(OF_TRAINING, reason)
+    interval_best = best
+    if isinstance(best, Tensor):
+        alone = []
+        for block in curriculum.trained:
+            values = set(best[list(block)].tolist())
+            alone.append(values.pop() if len(values) == 1 else math.nan)
+        interval_best = float64(alone)[log.training("block").long() - 1]
     return {
         "episodes": log.training("episodes"),
         "returns": log.training("return_mean"),
         "labelling": _labelling(log, curriculum),
-        "interval_best": _interval_best(log, curriculum, best),
+        "interval_best": interval_best,
         **_first_blocks(log, curriculum),
     }
 
@@ -212,10 +218,9 @@ def _kind(tasks: Sequence[TaskLike]) -> str:
 
 def _check_same(log: RunLog, curriculum: Curriculum) -> None:
     given = curriculum.fingerprint
-    for run in log.of_kind("run"):
-        learned = run.get("fingerprint", given)
-        other = f"the log is of {run.get('curriculum')} (fingerprint {learned}), not of {curriculum.name} ({given})"
-        require((learned == given, f"{other}: give the curriculum that the run learned, with all its changes"))
+    learned = log.about.get("fingerprint", given)
+    other = f"the log is of {log.about.get('curriculum')} (fingerprint {learned}), not of {curriculum.name} ({given})"
+    require((learned == given, f"{other}: give the curriculum that the run learned, with all its changes"))
     tasks = max((m["task"] for m in log.of_kind("evaluation") if not m.get("held_out")), default=0)
     block = len(log.ends()) - 1
     most = len(curriculum.tasks), len(curriculum.blocks)
@@ -317,16 +322,6 @@ def _known(value: Callable[[Task, float], float], task: Task) -> float:
         return math.nan
 
 
-def _interval_best(log: RunLog, curriculum: Curriculum, best: Tensor | Undefined) -> Tensor | Undefined:
-    if isinstance(best, Undefined):
-        return best
-    alone = []
-    for block in curriculum.trained:
-        values = set(best[list(block)].tolist())
-        alone.append(values.pop() if len(values) == 1 else math.nan)
-    return float64(alone)[log.training("block").long() - 1]
-
-
 def _labelling(log: RunLog, curriculum: Curriculum) -> Labelling | Undefined:
     acted = log.training("acted_label")
     ends = log.training("frames")
@@ -382,7 +377,7 @@ def _regimes(
     assert isinstance(best, Tensor)
     assert isinstance(lowest, Tensor)
     try:
-        regimes = log.regime_table(curriculum.trained, curriculum.labels)
+        regimes = log.regimes(curriculum.trained, curriculum.labels)
         require((not best.isnan().any(), "a task's optimal value is not known: its graph is too large"))
     except ValueError as error:
         return dict.fromkeys(("regimes", "experts"), Undefined(str(error)))

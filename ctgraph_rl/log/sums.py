@@ -12,12 +12,15 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from ctgraph_rl.checks import NamedValues, ReadOnlyValues, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_real, require
 from ctgraph_rl.disk import read_regular, write_whole
 from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG, METRICS, MOST_BYTES_OF_METRICS
-from ctgraph_rl.strict import json_value
+from ctgraph_rl.log.measurement import LARGEST
+from ctgraph_rl.strict import json_value, sha256_of
 
 FILES = "files"
+
+MOST_BYTES_OF_A_FILE = 2**33
 
 RESULTS = (LOG, CURRICULUM, AGENT, METRICS)
 """Files of a run, in the order of writing; ``curriculum.json`` only for parts of this package's classes."""
@@ -89,3 +92,41 @@ def stored_sums(run_dir: Path) -> Mapping[str, Mapping[str, Any]]:
 def sum_of(content: bytes) -> dict[str, Any]:
     """Return a content's length and SHA-256."""
     return {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+
+
+def damaged(run_dir: Path) -> list[str]:
+    """Return the files of a complete run that are not as they were written; reads all of them."""
+    try:
+        sums = stored_sums(run_dir)
+    except (OSError, ValueError):
+        return [METRICS]
+    found = []
+    for name, stored in sums.items():
+        path = run_dir / name
+        there = path.is_file() and path.stat().st_size == stored["bytes"]
+        if not there or sha256_of(path, MOST_BYTES_OF_A_FILE) != stored["sha256"]:
+            found.append(name)
+    return found
+
+
+def metrics_of(content: bytes) -> NamedValues:
+    """Return what `write_metrics` wrote, as plain values by name.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    found = json_value(content)
+    metrics = {name: found[name] for name in found if name != FILES} if isinstance(found, dict) else {}
+    ours = bool(metrics) and all(map(_is_metric, metrics.values()))
+    require((ours, "it does not hold metrics of ours"))
+    return metrics
+
+
+def _is_metric(metric: Any) -> bool:
+    if not (isinstance(metric, dict) and {"value", "definition", "undefined"} <= metric.keys()):
+        return False
+    values = [metric["value"]]
+    if isinstance(metric.get("windows"), list):
+        values += metric["windows"]
+    number = all(value is None or is_real(value, -LARGEST, LARGEST) for value in values)
+    return number and isinstance(metric["definition"], str) and isinstance(metric["undefined"], str | None)

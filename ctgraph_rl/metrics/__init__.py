@@ -18,7 +18,7 @@ from ctgraph_rl.metrics.lifetime import prepare
 from ctgraph_rl.metrics.matrix import Trained, average_performance, backward_transfer, forgetting, forward_transfer
 from ctgraph_rl.metrics.optimum import STAGES
 from ctgraph_rl.metrics.record import MASTERED, METRICS, Definition, Entry, Metric, Undefined, undefined
-from ctgraph_rl.metrics.regimes import Column, Regime, RegimeTable
+from ctgraph_rl.metrics.regimes import Regime, RegimeTable
 from ctgraph_rl.metrics.transfer import check_experts, mean_area, stage_areas, trapezoid_area
 
 SUMMARY = (average_performance, forward_transfer, backward_transfer, forgetting)
@@ -107,7 +107,6 @@ __all__ = [
     "METRICS",
     "STAGES",
     "SUMMARY",
-    "Column",
     "Curves",
     "Definition",
     "Metric",

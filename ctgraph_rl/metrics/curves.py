@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 
@@ -73,13 +73,6 @@ class Curves:
         rows = [self.of_block(block) for block in range(len(self.trained) + 1)]
         nothing = torch.full_like(self.performance[0], torch.nan)
         return torch.stack([self.performance[row[-1]] if row else nothing for row in rows])
-
-    def smoothed(self, window: int) -> Curves:
-        """The means of the last ``window`` evaluations, fewer at the start."""
-        if window < 1:
-            raise ValueError(f"window must be >= 1, got {window}")
-        means = [self.performance[max(0, i + 1 - window) : i + 1].mean(0) for i in range(len(self.performance))]
-        return replace(self, performance=torch.stack(means))
 
     def own_block(self, task: int) -> int:
         """The one block, from 1, that trains a task."""

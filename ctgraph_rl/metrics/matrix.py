@@ -140,9 +140,9 @@ def zero_shot_performance(performance: Tensor, trained: Trained | None = None) -
 def isolated_forgetting(performance: Tensor, trained: Trained | None = None, scale: Tensor | None = None) -> Tensor:
     """F: what one block of another task takes from a task that was trained before; positive when it is forgotten.
 
-    The source first smooths curves over 20 evaluations, `Curves.smoothed`; its tables show the value times 10. Blocks
-    of other tasks after a task's first training count. The source's code counts only the first cycle of tasks, or of
-    more cycles a task's own later trainings, too. Undefined where a block trains several tasks, and for a single task.
+    The source first smooths curves over 20 evaluations; its tables show the value times 10. Blocks of other tasks after
+    a task's first training count. The source's code counts only the first cycle of tasks, or of more cycles a task's
+    own later trainings, too. Undefined where a block trains several tasks, and for a single task.
 
     Args:
         scale: what each task's changes are divided by; default: max |R[i, task]| of this matrix. The source takes it

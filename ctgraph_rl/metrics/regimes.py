@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -40,29 +40,26 @@ class Regime:
         return self.values[start:].mean().item()
 
 
-class Column(NamedTuple):
-    """`RegimeTable`'s entry of a regime."""
-
-    task: Any  # position of its task in the names
-    training: Any  # bool
-    length: Any  # number of its experiences
-
-
 class RegimeTable(Sequence[Regime]):
     """Regimes as arrays: a run that evaluates T tasks after each of T blocks has more than T^2 of them.
 
     Args:
+        names: of tasks.
+        task: each regime's task, by its position in the names.
+        training: False for an evaluation.
+        length: number of each regime's experiences.
         values: the experiences of all regimes in order, float64 [experiences].
 
     Raises:
         ValueError: for a regime that `Regime` refuses.
     """
 
-    def __init__(self, names: Sequence[str], columns: Column, values: Tensor) -> None:
+    def __init__(self, names: Iterable[str], task: Any, training: Any, length: Any, values: Tensor) -> None:
         self.names = tuple(names)
         self.values = values
-        self.task, self.length = (np.asarray(each, dtype=np.int64) for each in (columns.task, columns.length))
-        self.training = np.asarray(columns.training, dtype=bool)
+        self.task = np.asarray(task, dtype=np.int64)
+        self.training = np.asarray(training, dtype=bool)
+        self.length = np.asarray(length, dtype=np.int64)
         self.starts = np.concatenate([[0], self.length.cumsum()])
         finite = values.isfinite().numpy()
         wrong = [
@@ -78,17 +75,15 @@ class RegimeTable(Sequence[Regime]):
         if isinstance(regimes, RegimeTable):
             return regimes
         names = {task: i for i, task in enumerate(dict.fromkeys(each.task for each in regimes))}
-        columns = zip(*((names[each.task], each.training, len(each.values)) for each in regimes), strict=True)
-        values = (
-            torch.cat([each.values for each in regimes])
-            if regimes
-            else torch.empty(0, dtype=torch.float64, device="cpu")
-        )
-        return cls([*names], Column(*(columns if regimes else ((), (), ()))), values)
+        task = [names[each.task] for each in regimes]
+        training = [each.training for each in regimes]
+        length = [len(each.values) for each in regimes]
+        nothing = torch.empty(0, dtype=torch.float64, device="cpu")
+        return cls(names, task, training, length, torch.cat([nothing, *(each.values for each in regimes)]))
 
     def replaced(self, values: Tensor) -> RegimeTable:
         """Return the table with other values."""
-        return RegimeTable(self.names, Column(self.task, self.training, self.length), values)
+        return RegimeTable(self.names, self.task, self.training, self.length, values)
 
     def __len__(self) -> int:
         return len(self.task)

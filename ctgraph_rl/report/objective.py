@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ctgraph_rl.checks import did_you_mean, require
-from ctgraph_rl.log.damage import metrics_of
 from ctgraph_rl.log.files import METRICS
+from ctgraph_rl.log.sums import metrics_of
 from ctgraph_rl.metrics import METRICS as DEFINED
 from ctgraph_rl.metrics.inputs import OF_A_PART
 

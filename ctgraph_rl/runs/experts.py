@@ -18,9 +18,9 @@ from rich.console import Console
 
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, require
 from ctgraph_rl.disk import require_no_link
-from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.files import CHECKPOINTS, LOG, METRICS
 from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.log.sums import damaged
 from ctgraph_rl.runs.checkpoints import Checkpoints
 from ctgraph_rl.runs.session import Failures, Session
 from ctgraph_rl.tasks.curriculum import Curriculum

@@ -24,7 +24,7 @@ from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.disk import is_writable
 from ctgraph_rl.learn.refusals import check_share, notes, why_not_together
 from ctgraph_rl.learn.unit_metrics import unit_rules
-from ctgraph_rl.log.escape import terminal_text
+from ctgraph_rl.log.escape import listed, terminal_text
 from ctgraph_rl.log.files import CHECKPOINTS, CURRICULUM, LOG, METRICS
 from ctgraph_rl.log.provenance import code, code_changes, is_unknown, learners, versions
 from ctgraph_rl.log.run_log import RunLog
@@ -480,8 +480,7 @@ def is_finished(cfg: DictConfig, run_dir: Path) -> bool:
     changed = differences(about.get("config") or {}, config.plain(cfg))
     if changed:
         advice = "choose another hydra.run.dir, or overwrite=true to replace it"
-        more = f" and {len(changed) - FEW} more" if len(changed) > FEW else ""
-        raise FileExistsError(f"{run_dir} holds a run with {', '.join(changed[:FEW])}{more}; {advice}")
+        raise FileExistsError(f"{run_dir} holds a run with {listed(changed, FEW)}; {advice}")
     stale, unknown = changed_code(cfg, run_dir, {})
     if stale and cfg.overwrite != config.STALE:
         raise FileExistsError(f"{run_dir} holds a run of other code: {', '.join(stale)} changed; {START_AGAIN}")

@@ -88,10 +88,9 @@ def load(
     if not (run_dir / LOG).exists():
         raise FileNotFoundError(no_run(run_dir, below=False))
     log = RunLog.read(run_dir / LOG)
-    runs = log.of_kind("run")
-    require((bool(runs), f"{run_dir / LOG} has no first line of a run; it was stopped before it began"))
-    learned = _curriculum(run_dir, curriculum, runs[0].get("fingerprint"))
-    config = runs[0].get("config") or {}
+    require((bool(log.about), f"{run_dir / LOG} has no first line of a run; it was stopped before it began"))
+    learned = _curriculum(run_dir, curriculum, log.about.get("fingerprint"))
+    config = log.about.get("config") or {}
     seed = config.get("seed", 0)
     require((is_int(seed, 0, 2**63 - 1), f"{run_dir / LOG} has no seed: seed must be in [0, 2**63), got {seed!r:.80}"))
     build = _builder(run_dir, config, make_agent, make_method, learned)

@@ -20,13 +20,13 @@ from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_int, is_real, repe
 from ctgraph_rl.disk import read_regular
 from ctgraph_rl.learn.labels import Span, label_spans
 from ctgraph_rl.learn.progress import Count, silent
-from ctgraph_rl.log.damage import metrics_of
 from ctgraph_rl.log.escape import listed
 from ctgraph_rl.log.files import FAILURE, LOG, METRICS, MOST_BYTES_OF_METRICS, no_run, without_sweeps_files
 from ctgraph_rl.log.life_curves import by_windows
 from ctgraph_rl.log.measurement import check, parsed
 from ctgraph_rl.log.provenance import is_ours, targets
 from ctgraph_rl.log.run_log import MOST_BYTES, SCHEMA, RunLog, label_of, tuning_share
+from ctgraph_rl.log.sums import metrics_of
 from ctgraph_rl.metrics.adaptation import Adaptation
 from ctgraph_rl.runs.experts import EXPERT
 from ctgraph_rl.runs.settings import as_before, flat
@@ -385,7 +385,7 @@ def _metrics(path: Path, log: RunLog) -> tuple[NamedValues, str | None]:
             return {}, f"{file} cannot be read: {error}"
     reason = _failure(path)
     if reason is None:
-        total = log.of_kind("run")[0].get("num_frames")
+        total = log.about.get("num_frames")
         reached = max(m.get("frames", 0) for m in log.measurements)
         reason = "unfinished" if total is None else f"unfinished: {reached:,} of {total:,} frames"
     return {}, f"{reason}, with a torn last line" if log.torn_lines else reason
@@ -396,7 +396,6 @@ def _failure(path: Path) -> str | None:
 
 
 def _history(log: RunLog, values: Sequence[Value]) -> History:
-    about = log.of_kind("run")[0]
     performance = log.performance().tolist()
     evaluations: dict[str, Curve] = {}
     training: dict[int, Curve] = {}
@@ -416,7 +415,7 @@ def _history(log: RunLog, values: Sequence[Value]) -> History:
         experts_together += ["together" in each for each in line["experts"]]
     return History(
         labels=log.labels(len(performance[0])),
-        trained=tuple(tuple(number - 1 for number in block) for block in about.get("trained") or ()),
+        trained=tuple(tuple(number - 1 for number in block) for block in log.about.get("trained") or ()),
         ends=tuple(log.ends()),
         performance=performance,
         evaluations=evaluations,

@@ -236,7 +236,7 @@ class Recorder:
 
     def _show(self, run_dir: Path) -> None:
         self._member.log = RunLog.read(run_dir / LOG)
-        changed = ", ".join(code_changes(self.log.of_kind("run")[0], self._member.about))
+        changed = ", ".join(code_changes(self.log.about, self._member.about))
         fix = "choose another run_dir, or overwrite=True to run it again"
         require((not changed, f"{run_dir} was made by other code: {changed} changed; {fix}"))
         self.finished = True

@@ -25,14 +25,13 @@ from ctgraph_rl.disk import append_line, make_folder, remove_empty, sync_folder,
 from ctgraph_rl.learn.collective import Member
 from ctgraph_rl.learn.loop import Alone, Group, Lockstep, run_loop
 from ctgraph_rl.learn.progress import ProgressBar
-from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, FAILURE, LOG, METRICS, Locks
 from ctgraph_rl.log.provenance import NUMBERS_TOGETHER, code_changes, machine, provenance
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.saved import without_moments
 from ctgraph_rl.log.scores import scores
-from ctgraph_rl.log.sums import RESULTS, write_metrics
+from ctgraph_rl.log.sums import RESULTS, damaged, write_metrics
 from ctgraph_rl.metrics.windows import OF_LIFE
 from ctgraph_rl.packages import check_packages
 from ctgraph_rl.runs import config

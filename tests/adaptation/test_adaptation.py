@@ -21,8 +21,8 @@ import curricula
 from ctgraph_rl import Block, Evaluation, RunLog, learn_curriculum
 from ctgraph_rl.learn.collect import agent_specs
 from ctgraph_rl.learn.refusals import check_adaptation
-from ctgraph_rl.log.damage import metrics_of
 from ctgraph_rl.log.scores import scores
+from ctgraph_rl.log.sums import metrics_of
 from ctgraph_rl.runs.checkpoints import Checkpoints
 from ctgraph_rl.runs.read import read_run
 from ctgraph_rl.tasks.kinds.gym_task import GymTask

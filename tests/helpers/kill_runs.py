@@ -24,7 +24,7 @@ from typing import Any
 
 import torch
 
-from ctgraph_rl.log.damage import damaged, metrics_of
+from ctgraph_rl.log.sums import damaged, metrics_of
 
 TINY = ["agent.num_envs=16", "agent.num_steps=8", "agent.hidden_size=8", "checkpoint_seconds=0.01"]
 BLOCKS = ["curriculum=fo_b1_4tasks", "curriculum.num_frames=512", "evaluation.num_episodes=4", "evaluation.every=256"]

@@ -30,7 +30,7 @@ from baselines.cells.gru import GRU
 from baselines.methods.multitask import Multitask
 from ctgraph_rl import Block, Recorder, learn_curriculum, make_agent, scores
 from ctgraph_rl.checks import did_you_mean
-from ctgraph_rl.log.damage import metrics_of
+from ctgraph_rl.log.sums import metrics_of
 from ctgraph_rl.runs.config import composed, curriculum_of, with_names
 from ctgraph_rl.runs.job import run_job
 from curricula import su_b1_4tasks

@@ -11,7 +11,7 @@ from helpers.sweeping import command_line
 
 from ctgraph_rl import Block, RunLog, learn_curriculum
 from ctgraph_rl.learn.loop import Alone, Lockstep, run_loop
-from ctgraph_rl.log.damage import metrics_of
+from ctgraph_rl.log.sums import metrics_of
 from ctgraph_rl.report.objective import objective_of
 from ctgraph_rl.report.results import main as results_main
 from ctgraph_rl.runs.read import find_runs

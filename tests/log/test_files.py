@@ -22,9 +22,8 @@ from helpers.stopped_runs import StopsAfter, learn_into
 from ctgraph_rl import RunLog, disk, metrics
 from ctgraph_rl.disk import write_whole
 from ctgraph_rl.log import files
-from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.files import LOCK, LOG, METRICS, Locks, locked
-from ctgraph_rl.log.sums import stored_sums, sum_of, write_metrics
+from ctgraph_rl.log.sums import damaged, stored_sums, sum_of, write_metrics
 from ctgraph_rl.runs.status import status_of
 
 HOLD = """

@@ -256,7 +256,7 @@ def test_fields_of_training_and_of_the_last_evaluations_are_read_by_name():
     log = learned(RunLog())
 
     assert log.training("frames").tolist() == [50, 100, 150, 200]
-    assert log.training("return_mean", block=2).isnan().tolist() == [True, False]
+    assert log.training_by_block("return_mean")[2].isnan().tolist() == [True, False]
     assert log.last("return_mean").tolist() == [0.75, 1.0]
     assert log.last("end_rate", num_tasks=3).isnan().all()
 

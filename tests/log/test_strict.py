@@ -12,9 +12,9 @@ import pytest
 import yaml
 
 from ctgraph_rl import strict
-from ctgraph_rl.log.damage import metrics_of
 from ctgraph_rl.log.measurement import check
 from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.log.sums import metrics_of
 
 LINE = b'{"kind": "run", "curriculum": "a", "config": {"seed": 0}}\n'
 

@@ -218,13 +218,6 @@ def test_a_missing_evaluation_is_never_taken_for_a_zero(metric):
     assert (found.value, found.n_undefined) == (None, 1)
 
 
-def test_smoothing_takes_the_last_evaluations_only():
-    smoothed = CURVES.smoothed(2).performance[:, 0]
-
-    assert smoothed.tolist() == [0.0, 0.25, 0.75, 0.875, 0.625, 0.375, 0.25]
-    assert torch.equal(CURVES.smoothed(1).performance, CURVES.performance)
-
-
 def test_all_metrics_without_experts_are_computed_by_name():
     found = metrics.of_curves(CURVES)
 

@@ -138,7 +138,6 @@ def test_every_name_that_is_exported_is_listed_and_there():
     assert sorted(names) == [
         *(
             "AGAINST_EXPERTS",
-            "Column",
             "Curves",
             "Definition",
             "MASTERED",

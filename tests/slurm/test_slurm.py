@@ -20,7 +20,7 @@ import torch
 from helpers.paths import TESTS
 
 from ctgraph_rl import RunLog
-from ctgraph_rl.log.damage import metrics_of
+from ctgraph_rl.log.sums import metrics_of
 
 pytestmark = pytest.mark.slurm
 
