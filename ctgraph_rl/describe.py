@@ -133,7 +133,13 @@ def _overview(curriculum: Curriculum, frames_per_second: float | None) -> Sheet:
         "evaluation": evaluation_in_words(curriculum.evaluation, isinstance(curriculum, Stream)),
     }
     if isinstance(curriculum, Stream):
-        rows["neighbours"] = _neighbours(curriculum)
+        pairs = list(pairwise(curriculum.tasks[:MOST_SHOWN]))
+        rows["neighbours"] = "there is one task"
+        if pairs:
+            images = fmean(shared_images(pair)[0, 1].item() for pair in pairs)
+            actions = fmean(state_agreement(pair)[0, 1].item() for pair in pairs)
+            alike = f"{images:.0%} of images and {actions:.0%} of states with the same best actions"
+            rows["neighbours"] = f"share {alike}, the mean of the first {len(pairs)} pairs"
     if are_graphs(curriculum.examples):
         bank, per_row = memory(curriculum)
         evaluations = _duration(_evaluation_seconds(curriculum))
@@ -147,16 +153,6 @@ def _overview(curriculum: Curriculum, frames_per_second: float | None) -> Sheet:
 
 def _graphs(curriculum: Curriculum) -> Sequence[Task]:
     return ct_graphs(curriculum.examples, "this sheet")
-
-
-def _neighbours(stream: Stream) -> str:
-    pairs = list(pairwise(stream.tasks[:MOST_SHOWN]))
-    if not pairs:
-        return "there is one task"
-    images = fmean(shared_images(pair)[0, 1].item() for pair in pairs)
-    actions = fmean(state_agreement(pair)[0, 1].item() for pair in pairs)
-    alike = f"{images:.0%} of images and {actions:.0%} of states with the same best actions"
-    return f"share {alike}, the mean of the first {len(pairs)} pairs"
 
 
 def _time(curriculum: Curriculum, frames_per_second: float | None) -> str:

@@ -135,8 +135,11 @@ def log_training(
     num_rows = len(batch) // len(logs)
     end = start + num_rows * batch.shape[1]
     returns: list[float] = []
-    for part in _split_at_ends(batch, num_rows, start, curriculum.ends):
-        frames += num_rows * part.shape[1]
+    within = curriculum.ends[bisect_right(curriculum.ends, start) : bisect_left(curriculum.ends, end)]
+    cuts = [0, *((each - start) // num_rows for each in within), batch.shape[1]]
+    for first, last in pairwise(cuts):
+        part = batch[:, first:last]
+        frames += num_rows * (last - first)
         block = curriculum.block_at(frames)
         after = part["next"].get(ENDS, part["next"])
         is_end = after["done"].squeeze(-1)
@@ -152,11 +155,3 @@ def log_training(
             log.append("training", block=block, frames=frames, **measured)
             returns.append(episodes["return_mean"])
     return returns
-
-
-def _split_at_ends(batch: TensorDictBase, rows: int, start: int, ends: Sequence[int]) -> Iterator[TensorDictBase]:
-    steps = batch.shape[1]
-    first = bisect_right(ends, start)
-    last = bisect_left(ends, start + rows * steps)
-    cuts = [0, *((end - start) // rows for end in ends[first:last]), steps]
-    return (batch[:, begin:end] for begin, end in pairwise(cuts))

@@ -253,21 +253,21 @@ def _built(kind: type, content: Any, tasks: Sequence[TaskLike] = ()) -> Any:
     require_keys(content, [name for name in _names(kind) if name not in added], added)
     arguments = {}
     for name, item in content.items():
+        place = (kind, name)
         with within(name):
-            arguments[name] = _field((kind, name), item, tasks)
+            value = item
+            if place in _PARTS:
+                value = _built(_PARTS[place], item)
+            elif place in _CHOICES and (item is not None or place != (Block, "switch")):
+                value = _chosen(_CHOICES[place], item)
+            elif place in _OF_TASKS:
+                holds = are_ints(item, 0, len(tasks) - 1)
+                require((holds, f"must be positions in the list of {len(tasks)} tasks, from 0, got {item!r:.80}"))
+                value = tuple(tasks[i] for i in item)
+            elif place in _OF_ARGUMENTS:
+                value = from_json(item)
+            arguments[name] = value
     return kind(**arguments)
-
-
-def _field(place: tuple[type, str], content: Any, tasks: Sequence[TaskLike]) -> Any:
-    if place in _PARTS:
-        return _built(_PARTS[place], content)
-    if place in _CHOICES and (content is not None or place != (Block, "switch")):
-        return _chosen(_CHOICES[place], content)
-    if place in _OF_TASKS:
-        holds = are_ints(content, 0, len(tasks) - 1)
-        require((holds, f"must be positions in the list of {len(tasks)} tasks, from 0, got {content!r:.80}"))
-        return tuple(tasks[i] for i in content)
-    return from_json(content) if place in _OF_ARGUMENTS else content
 
 
 def _chosen(kinds: Sequence[type], content: Any, tasks: Sequence[TaskLike] = ()) -> Any:
