@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.checks import NamedValues, require, takes_numbers
+from ctgraph_rl.checks import NamedValues, as_tuple, require, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL
 from ctgraph_rl.env import CTGraphEnv
@@ -28,7 +28,7 @@ from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.metrics.adaptation import exact_search
 from ctgraph_rl.policies import RandomPolicy
 from ctgraph_rl.tasks.curriculum import Curriculum
-from ctgraph_rl.tasks.kinds.task_like import TaskLike, close_env, require_tasks
+from ctgraph_rl.tasks.kinds.task_like import TaskLike, are_tasks, close_env
 from ctgraph_rl.tasks.protocol import Evaluation
 from ctgraph_rl.tasks.task import Task
 
@@ -75,7 +75,10 @@ def evaluate(
         >>> evaluate(OptimalPolicy, [ct_su_b1()], num_episodes=10)["episode_reward"].mean().item()
         1.0
     """
-    tasks = require_tasks(tasks)
+    given: Any = as_tuple(tasks)
+    rule = "tasks must be a list with at least one Task"
+    require((given != (), f"{rule}, got none"), *are_tasks(rule, given))
+    tasks = given
     Evaluation(num_episodes, greedy, episodes_per_row).check(tasks)
     bound = isinstance(policy, RandomPolicy)
     require((callable(policy), f"policy must be a function or a module that writes actions, got {policy!r:.80}"))

@@ -36,9 +36,12 @@ def test_a_reference_policy_of_another_environment_is_refused():
         evaluate(OptimalPolicy(CTGraphEnv([surjective()])), [surjective()])
 
 
-@pytest.mark.parametrize(("tasks", "found"), [([surjective(), 3], "Task, int"), ([], "none"), ("x", "str")])
+@pytest.mark.parametrize(
+    ("tasks", "found"),
+    [([surjective(), 3], r"\(<Task .*, 3\); a task is a Task, a"), ([], "none$"), ("x", "'x'; a task is a Task, a")],
+)
 def test_what_is_no_list_of_tasks_is_refused(tasks, found):
-    with pytest.raises(ValueError, match=f"^tasks must be a list with at least one Task, got {found}$"):
+    with pytest.raises(ValueError, match=f"^tasks must be a list with at least one Task, got {found}"):
         evaluate(OptimalPolicy, tasks)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any, Protocol
 
-from ctgraph_rl.checks import Rule, as_tuple, require
+from ctgraph_rl.checks import Rule, require
 
 
 class TaskLike(Hashable, Protocol):
@@ -120,21 +120,6 @@ def _task_rule(kind: type) -> Rule:
         return False, f"{kind.__name__} is no task, it cannot be hashed: put @dataclass(frozen=True) above its class"
     fix = "see ctgraph_rl.tasks.kinds.task_like.TaskLike"
     return not missing, f"{kind.__name__} is no task, it lacks {', '.join(missing)}: {fix}"
-
-
-def require_tasks(values: Iterable[TaskLike]) -> tuple[Any, ...]:
-    """Return at least one task, all of one kind.
-
-    Raises:
-        ValueError: for anything else.
-    """
-    tasks = as_tuple(values)
-    found = [type(each).__name__ for each in tasks] if isinstance(tasks, tuple) else [type(values).__name__]
-    message = f"tasks must be a list with at least one Task, got {', '.join(sorted({*found})) or 'none'}"
-    is_list = isinstance(tasks, tuple) and bool(tasks) and all(map(_is_value, tasks))
-    require((is_list, message))
-    require(*are_tasks("tasks", tasks))
-    return tuple(values)
 
 
 def environment(kind: type) -> Callable[..., Any]:
