@@ -47,7 +47,7 @@ def task_figure(task: Task, **overlays: Any) -> Any:
     """Return a new figure of a size that fits `draw_task`, with the same arguments."""
     graph = task.graph
     side_by_side = graph.num_end_states if graph.num_end_states <= MOST_LEAVES else MOST_PATHS
-    beside = 0.9 if overlays.get("policy") or overlays.get("values") else 0.65
+    beside = 0.9 if overlays.get("policy") else 0.65
     width = min(max(5.5, beside * side_by_side), 14.0)
     figure = new_figure(width, 1.2 + 0.75 * min(2 * graph.depth + 2, 9))
     draw_task(figure.subplots(), task, **overlays)
@@ -59,7 +59,6 @@ def draw_task(
     task: Task,
     visits: Counted | None = None,
     policy: PerAction | None = None,
-    values: PerAction | None = None,
     ids: bool = True,
     legend: bool = True,
 ) -> None:
@@ -76,25 +75,22 @@ def draw_task(
         axes: matplotlib axes, at their final size.
         visits: how often each state was visited, from `ctgraph_rl.play.visits.visits`: numbers in the nodes instead of
             ids, and the width of edges.
-        policy: b + 1 action probabilities of each state, or its greedy action: numbers at edges; the likeliest action
-            is black.
-        values: b + 1 numbers for each state, such as Q-values, at the edges.
+        policy: b + 1 action probabilities of each state: numbers at edges; the likeliest action is black.
         ids: observation ids in the nodes; False: initials of the kinds.
         legend: name shapes and colours below the tree.
     """
-    _TaskPicture(axes, task, visits or {}, policy=policy or {}, values=values or {}, ids=ids).draw(legend)
+    _TaskPicture(axes, task, visits or {}, policy=policy or {}, ids=ids).draw(legend)
 
 
 class _TaskPicture:
-    def __init__(self, axes: Any, task: Task, visits: Counted, policy: PerAction, values: PerAction, ids: bool) -> None:
+    def __init__(self, axes: Any, task: Task, visits: Counted, policy: PerAction, ids: bool) -> None:
         self.axes = axes
         self.task = task
         self.visits = visits
         self.ids = ids
         self.graph = task.graph
         self.goal = task.graph.node_at(task.goal)
-        self.policy = {key: _probabilities(of, self.graph.branching_factor) for key, of in policy.items()}
-        self.values = {key: [float(value) for value in of] for key, of in values.items()}
+        self.policy = {key: [float(chance) for chance in of] for key, of in policy.items()}
         counts = {}
         for (kind, node), count in visits.items():
             if kind == END and node != self.goal:
@@ -184,14 +180,9 @@ class _TaskPicture:
         return 1.6 if self._is_strong(edge) else 0.8
 
     def _numbers(self, state: Key, actions: Sequence[int]) -> str:
-        if not self.has_numbers:
+        if not self.has_numbers or state not in self.policy:
             return ""
-        parts = []
-        if state in self.policy:
-            parts.append(f"{sum(_pick(self.policy[state], actions)):.2f}")
-        if state in self.values:
-            parts.append(f"Q {max(_pick(self.values[state], actions)):.2f}")
-        return "\n".join(parts)
+        return f"{sum(_pick(self.policy[state], actions)):.2f}"
 
     def _draw_states(self) -> None:
         for state, place in (*self.places.items(), (FAIL_KEY, (0.97, 0.0))):
@@ -234,7 +225,7 @@ class _TaskPicture:
             if kind in (WAIT, DECISION):
                 b = self.graph.branching_factor
                 right = (WAIT_ACTION,) if kind == WAIT else range(1, b + 1)
-                most = max(b + 1, len(self.policy.get((kind, node), ())), len(self.values.get((kind, node), ())))
+                most = max(b + 1, len(self.policy.get((kind, node), ())))
                 wrong = [action for action in range(most) if action not in right]
                 arrow = base | {"linewidth": 0.8 + 2 * sum(_pick(self.policy.get((kind, node), ()), wrong))}
                 self._note("", place, (1.1 * self.size, 0), arrowprops=arrow, zorder=2)
@@ -261,7 +252,6 @@ class _TaskPicture:
         width = self.axes.figure.get_figwidth() / (1 if spec is None else spec.get_gridspec().ncols)
         nodes = "visits" if self.visits else "observation ids" if self.ids else ""
         numbers = ["probability"] if self.policy and self.has_numbers else []
-        numbers += ["Q"] if self.values and self.has_numbers else []
         at_edges = f"at edges: {', '.join(['action', *numbers])}" if self.has_room else ""
         black = "black: the likeliest action" if self.policy else ""
         meaning = "; ".join(filter(None, [f"in nodes: {nodes}" if nodes else "", at_edges, black]))
@@ -277,12 +267,6 @@ class _TaskPicture:
             handletextpad=0.3,
             columnspacing=1.0,
         )
-
-
-def _probabilities(choice: Any, branching_factor: int) -> list[float]:
-    if not isinstance(choice, Sequence) and getattr(choice, "ndim", 0) == 0:
-        return [float(action == int(choice)) for action in range(max(branching_factor, int(choice)) + 1)]
-    return [float(chance) for chance in choice]
 
 
 def _pick(numbers: Sequence[float], actions: Sequence[int]) -> list[float]:
