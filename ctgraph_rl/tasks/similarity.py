@@ -1,9 +1,9 @@
 """Similarity of tasks: exact measures of goals, optimal actions, images and graphs, as matrices.
 
 All measures are shares in [0, 1] and symmetric. States of two graphs are matched by the branches that lead to them, in
-the *common tree*: branches and depth up to the smaller of both. *Optimal* actions maximise the expected discounted
-return; those above a task's branching factor fail. Where nothing is at stake, all actions are optimal. Goals that
-change, and noise and rotation on read, are left aside.
+the *common tree*: branches and depth up to the smaller of both. *Optimal* actions maximise the expected return;
+those above a task's branching factor fail. Where nothing is at stake, all actions are optimal. Goals that change, and
+noise and rotation on read, are left aside.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import fraction, require, require_all
+from ctgraph_rl.checks import require, require_all
 from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.tasks.images import ImageSet
 from ctgraph_rl.tasks.memory import bank_bytes
@@ -63,10 +63,10 @@ def shared_decisions(tasks: Sequence[Task]) -> Tensor:
     return _matrix(_tasks(tasks), share)
 
 
-def state_agreement(tasks: Sequence[Task], gamma: float = 1.0) -> Tensor:
+def state_agreement(tasks: Sequence[Task]) -> Tensor:
     """Share of the wait and decision states of the common tree with equal sets of optimal actions; float64 [T, T].
 
-    Two needles take O(depth); other rewards visit every state. ``gamma`` is in [0, 1].
+    Two needles take O(depth); other rewards visit every state.
 
     Raises:
         ValueError: for rewards other than `Needle` beyond `values.MAX_ENUMERATED_STATES` states.
@@ -81,15 +81,15 @@ def state_agreement(tasks: Sequence[Task], gamma: float = 1.0) -> Tensor:
                 equal += count(one, other, kind, level, tree.branching_factor)
         return equal / (tree.num_decision_states + tree.num_wait_states)
 
-    return _matrix(_choices(_tasks(tasks), gamma), share)
+    return _matrix(_choices(tasks), share)
 
 
-def observation_agreement(tasks: Sequence[Task], gamma: float = 1.0) -> Tensor:
+def observation_agreement(tasks: Sequence[Task]) -> Tensor:
     """Share of the observations of both tasks whose optimal memoryless actions are equal; float64 [T, T].
 
     For each image that wait and decision states of both tasks can show, a task leaves the actions that are optimal in
     all of its states that can show it. Tasks agree where they leave the same actions, and any at all: the diagonal is
-    below 1 for tasks that need memory. nan where no image is shown in both. ``gamma`` is in [0, 1].
+    below 1 for tasks that need memory. nan where no image is shown in both.
 
     Raises:
         ValueError: beyond `values.MAX_ENUMERATED_STATES` states where every state has to be visited, and for image sets
@@ -101,7 +101,7 @@ def observation_agreement(tasks: Sequence[Task], gamma: float = 1.0) -> Tensor:
         return sum(one[i] == other[i] and any(one[i]) for i in shown) / len(shown) if shown else math.nan
 
     found = []
-    for choice in _choices(_tasks(tasks), gamma):
+    for choice in _choices(tasks):
         left: dict[bytes, Tensor] = {}  # for each image, the actions that are optimal in all states that show it
         for ids, actions in _shown_with_actions(choice):
             for content in _contents(choice.task, ids):
@@ -201,28 +201,28 @@ class _Choices:
         return self.sets[kind, level][nodes]
 
 
-def _choices(tasks: tuple[Task, ...], gamma: float) -> list[_Choices]:
-    require(*fraction(gamma=gamma))
+def _choices(tasks: Sequence[Task]) -> list[_Choices]:
+    tasks = _tasks(tasks)
     num_actions = 1 + max(task.graph.branching_factor for task in tasks)
-    return [_Choices(task, _optimal_sets(task, gamma, num_actions), is_needle(task)) for task in tasks]
+    return [_Choices(task, _optimal_sets(task, num_actions), is_needle(task)) for task in tasks]
 
 
-def _optimal_sets(task: Task, gamma: float, num_actions: int) -> ActionSets:
+def _optimal_sets(task: Task, num_actions: int) -> ActionSets:
     tree = smallest_tree(task, is_needle(task))
-    best = BestActions(task, gamma)
+    best = BestActions(task, gamma=1.0)
     step = task.step_reward
     fails = best.failing
     steps = 2 * (task.graph.depth + 1) / (1 - task.graph.wait_prob)
     margin = ROUNDING * (abs(task.goal_reward) + abs(task.fail_reward) + abs(step) * steps)  # of the largest value
-    arrival = tree.end_rewards() + (gamma * step if task.extra_end_step else 0.0)
+    arrival = tree.end_rewards() + (step if task.extra_end_step else 0.0)
     sets = {}
     for level in reversed(range(task.graph.depth + 1)):
         sets[StateType.WAIT, level] = _best(best.waiting(arrival).unsqueeze(-1), fails, num_actions, 0, margin)
         if level > 0:
             children = tree.children(best.at_wait(arrival, level), level - 1)
-            deciding = step + gamma * children
+            deciding = step + children
             sets[StateType.DECISION, level - 1] = _best(deciding, fails, num_actions, 1, margin)
-            arrival = gamma * best.at_decision(children, level - 1)
+            arrival = best.at_decision(children, level - 1)
     return sets
 
 
