@@ -239,7 +239,7 @@ def test_images_and_observations_are_those_that_the_environment_shows(tasks):
     left = []
     for task, images in zip(tasks, recorded, strict=True):
         actions = {}
-        for key, best in optimal_sets(task, 1.0, num_actions).items():
+        for key, best in optimal_sets(task, num_actions).items():
             for image in images[key]:
                 actions[image] = actions.get(image, best) & best
         left.append(actions)
