@@ -22,7 +22,7 @@ from baselines.parts.policy_gradient import PolicyGradient, Seeds
 from baselines.update.measured import finite_means, table_of
 from baselines.update.seeds import SeedGroup, has_stackable, learner_of, or_error, sampled, why_not_step, write_rows
 from baselines.update.stack import Stack
-from baselines.update.update import update
+from baselines.update.update import update, usual_update
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.core import philox
 from ctgraph_rl.core.region import Region
@@ -251,4 +251,4 @@ class CapturedGroup(SeedGroup):
         return self._region.copies(minibatch)
 
     def _usual_update(self, minibatch: Data) -> TensorsByName:
-        return (self.first.compiled_step or update)(self.first, self.stack.state, minibatch)
+        return usual_update(self.first, self.stack.state, minibatch)

@@ -25,7 +25,7 @@ from baselines.parts.networks import Data, Items, TensorsByName
 from baselines.update.compiled import compiler_options
 from baselines.update.measured import table_of
 from baselines.update.stack import Stack
-from baselines.update.update import has_parts, update
+from baselines.update.update import has_parts, update, usual_update
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.learn.collect import Policy
 from ctgraph_rl.learn.loop import Learnt
@@ -274,9 +274,8 @@ class SeedGroup:
 
     def _step(self, stack: Stack, batch: Items) -> TensorsByName:
         first = stack.learners[0]
-        usual = batch["action"].shape[1] == first.minibatch_size
-        function = first.compiled_step if usual and first.compiled_step is not None else update
-        return function(first, stack.state, batch)
+        take = usual_update if batch["action"].shape[1] == first.minibatch_size else update
+        return take(first, stack.state, batch)
 
 
 Outputs = Callable[..., TensorsByName]

@@ -45,7 +45,7 @@ class Trained(nn.Module):
         """Return the losses of a batch, as `ctgraph_rl.agent.Agent`."""
         raise NotImplementedError
 
-    def losses(self, batch: Data, weights: Sequence[Tensor], others: Data) -> TensorsByName:
+    def losses(self, weights: Sequence[Tensor], batch: Data, others: Data) -> TensorsByName:
         """Return the agent's losses, and the penalties of plasticity and method.
 
         Args:

@@ -93,8 +93,8 @@ def update(learner: Trained, state: UpdateState, batch: Data) -> TensorsByName:
 def losses_of(learner: Trained, state: UpdateState, batch: Data) -> TensorsByName:
     """Return the agent's losses and the method's penalties, of each seed if there are several."""
     if state.tensors is None:
-        return learner.losses(batch, state.weights, state.others)
-    return over_seeds(learner, _losses, state, batch, state.others)
+        return learner.losses(state.weights, batch, state.others)
+    return over_seeds(learner, type(learner).losses, state, batch, state.others)
 
 
 def over_seeds(learner: Trained, function: Callable[..., Any], state: UpdateState, *given: Any) -> Any:
@@ -118,10 +118,6 @@ def _with(
 ) -> Any:
     weights = [tensors[name] for name in state.names]
     return functional_call(learner, tensors, (function, weights, *given), tie_weights=False)
-
-
-def _losses(learner: Trained, weights: Sequence[Tensor], batch: Data, others: Data) -> TensorsByName:
-    return learner.losses(batch, weights, others)
 
 
 def _seen(state: UpdateState) -> TensorsByName:
@@ -278,19 +274,21 @@ def step(optimiser: Parts | torch.optim.Optimizer, gradients: Sequence[Tensor]) 
 
 def take_step(learner: Trained, batch: Data) -> TensorsByName:
     """Take a step; the first one and unusual sizes run `update` as written."""
-    if len(batch["action"]) != learner.minibatch_size or not learner.optimiser.state:
-        return update(learner, update_state(learner), batch)
+    is_first = not learner.optimiser.state
+    state = update_state(learner)
+    if is_first or len(batch["action"]) != learner.minibatch_size:
+        return update(learner, state, batch)
     if not is_captured(learner):
-        return usual_update(learner, batch)
-    learner.region = learner.region or Region(partial(usual_update, learner))
+        return usual_update(learner, state, batch)
+    learner.region = learner.region or Region(partial(usual_update, learner, state))
     if not learner.region.takes(batch):
-        return update(learner, update_state(learner), batch)
+        return update(learner, state, batch)
     return learner.region.copies(batch)
 
 
-def usual_update(learner: Trained, batch: Data) -> TensorsByName:
+def usual_update(learner: Trained, state: UpdateState, batch: Data) -> TensorsByName:
     """Take the step, compiled where the agent is."""
-    return (learner.compiled_step or update)(learner, update_state(learner), batch)
+    return (learner.compiled_step or update)(learner, state, batch)
 
 
 def update_state(learner: Trained) -> UpdateState:

@@ -256,7 +256,7 @@ def test_targets_are_of_the_weights_that_a_loss_is_given(small_agent, name):
     minibatch = next(agent.minibatches(batch))
     before = agent.loss(minibatch)["loss_value"]
 
-    given = agent.losses(minibatch, agent.weights, {key: 2 * value for key, value in agent.other_weights().items()})
+    given = agent.losses(agent.weights, minibatch, {key: 2 * value for key, value in agent.other_weights().items()})
     for value in agent.other_weights().values():
         value.data.mul_(2)
 

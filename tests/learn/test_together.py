@@ -174,7 +174,7 @@ def of_all(group: SeedGroup, minibatches) -> tuple[dict[str, torch.Tensor], list
 
 def of_one(learner, minibatch) -> tuple[dict[str, torch.Tensor], list[torch.Tensor]]:
     batch = {key: wide(value) for key, value in minibatch.items()}
-    losses = learner.losses(batch, learner.weights, learner.other_weights())
+    losses = learner.losses(learner.weights, batch, learner.other_weights())
     gradients = torch.autograd.grad(total_loss(losses), learner.weights)
     return losses, list(learner.method.transform_gradients(gradients, learner.weights))
 
