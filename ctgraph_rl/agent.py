@@ -106,14 +106,6 @@ class Model(Protocol):
         ...
 
 
-class DetectorLike(Protocol):
-    """A detector of task changes, which labels tasks. `ctgraph_rl.run` builds it as ``Class(**yaml)``."""
-
-    def labelling(self, method: MethodLike) -> MethodLike:
-        """Return a method with this detector's task ids and boundaries."""
-        ...
-
-
 class PlasticityLike(Protocol):
     """Keeps an agent's network able to learn. `ctgraph_rl.run` builds it as ``Class(**yaml)``."""
 

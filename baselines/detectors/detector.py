@@ -70,7 +70,7 @@ class Detector(TakesNumbers):
         self.snapshot_every = snapshot_every
 
     def labelling(self, method: MethodLike) -> Detector:
-        """Return this detector as a method, whose tasks it labels, as `ctgraph_rl.agent.DetectorLike`."""
+        """Return this detector as a method, with its task ids and boundaries in place of the curriculum's."""
         self.method = method
         return self
 
