@@ -34,7 +34,7 @@ from torch.nn.functional import one_hot, softplus
 from torchrl.data import Composite, TensorSpec
 from typing_extensions import override
 
-from baselines.parts.gates import GATES, GatedNetwork, gated_network, require_gated_weights, shown_specs
+from baselines.parts.gates import GATES, GatedNetwork, require_gated_weights, shown_specs
 from baselines.parts.inner_loop import places
 from baselines.parts.learner import MOST_PASSES, Learner
 from baselines.parts.networks import Data, Items, TensorsByName, draw, entropy, guided, is_greedy, num_actions_of
@@ -202,7 +202,7 @@ class PEARL(Learner):
         self.minibatch_size = given.num_trials
         self.specs = shown_specs(observation_spec)
         network = partial(
-            gated_network,
+            GatedNetwork,
             self.specs,
             hidden_size=given.hidden_size,
             num_layers=given.num_layers,

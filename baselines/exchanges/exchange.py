@@ -27,6 +27,8 @@ class Exchange(TakesNumbers):
         delay_prob: probability that a message which is not lost arrives at the next exchange.
     """
 
+    kinds: Sequence[str] = ()
+
     def __init__(self, num_members: int, every: int, drop_prob: float, delay_prob: float) -> None:
         require(
             *at_least_one(num_members=num_members, every=every),
@@ -36,7 +38,6 @@ class Exchange(TakesNumbers):
         self.every = every
         self.drop_prob = drop_prob
         self.delay_prob = delay_prob
-        self.kinds: Sequence[str] = ()
 
     def settings_of(self, member: int) -> ReadOnlyValues:
         """Return none; methods as in `ctgraph_rl.learn.collective.ExchangeLike`."""
@@ -70,6 +71,7 @@ class MaskExchange(Exchange):
     All members have the same network behind their masks.
     """
 
+    kinds = ("query", "offer", "request", "mask")
     method = "mask_ri"
 
     def connect(self, agents: Sequence[Agent]) -> None:

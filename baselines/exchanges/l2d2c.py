@@ -12,7 +12,6 @@ from typing_extensions import override
 from baselines.exchanges.exchange import MaskExchange
 from baselines.methods.mask_lc import MaskLC
 from baselines.methods.parts.masks import Masks
-from ctgraph_rl.agent import Agent
 from ctgraph_rl.learn.collective import Help
 from ctgraph_rl.learn.messages import Message, to_all
 
@@ -33,11 +32,6 @@ class L2D2C(MaskExchange):
     def takes(self, method: Masks) -> bool:
         """Return whether a task's mask uses only its scores."""
         return not isinstance(method, MaskLC)
-
-    @override
-    def connect(self, agents: Sequence[Agent]) -> None:
-        super().connect(agents)
-        self.kinds = ("query", "offer", "request", "mask")
 
     @override
     def send(self, kind: str, member: int, received: Sequence[Message]) -> Sequence[Message]:

@@ -107,7 +107,6 @@ class Mosaic(MaskExchange):
         require((self.top_n <= room, f"top_n must be at most method.max_received={room}, got {self.top_n}"))
         self.num_actions = max(method.num_actions for method in self.methods)
         self.known: list[KnownMask] = [KnownMask() for _ in agents]
-        self.kinds = ("query", "offer", "request", "mask")
 
     def observe(self, member: int, batch: TensorDictBase, episode_return: float) -> None:
         """Keep the batch's last transitions and its mean return, and update the embedding."""

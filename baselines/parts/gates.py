@@ -7,8 +7,6 @@ s, 1 at 0, and ``none`` no gate. A hard gate has no gradient: it stays random, a
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
@@ -60,9 +58,7 @@ class GatedNetwork(nn.Module):
     """Layers from observations to logits; weights as in Glorot & Bengio 2010, biases 0.
 
     Args:
-        shape: of one observation.
-        high: largest value of an observation.
-        num_ids: number of task ids.
+        specs: of what it sees, from `shown_specs`.
         num_extra: width of further inputs.
         hidden_size: width of each layer.
         num_layers: layers before the output, which has no gate.
@@ -72,20 +68,25 @@ class GatedNetwork(nn.Module):
 
     def __init__(
         self,
-        shape: torch.Size,
-        high: float,
-        num_ids: int,
+        specs: dict[str, TensorSpec],
         num_extra: int,
+        num_outputs: int,
+        *,
         hidden_size: int,
         num_layers: int,
-        num_outputs: int,
         gate: str,
         gate_size: int,
     ) -> None:
         super().__init__()
-        self.event_dims = len(shape)
-        self.scale = 1 / high
-        first = GatedLayer(shape.numel(), hidden_size, gate, gate_size, num_ids=num_ids, num_extra=num_extra)
+        observation = specs["observation"]
+        self.event_dims = len(observation.shape)
+        self.scale = 1 / highest(observation)
+        num_ids = 0
+        if TASK_NUMBER in specs:
+            num_ids = int(specs[TASK_NUMBER].space.high) + 1
+        elif "task_id" in specs:
+            num_extra += specs["task_id"].shape.numel()
+        first = GatedLayer(observation.shape.numel(), hidden_size, gate, gate_size, num_ids, num_extra)
         self.layers = nn.ModuleList([first])
         for _ in range(num_layers - 1):
             self.layers.append(GatedLayer(hidden_size, hidden_size, gate, gate_size))
@@ -116,22 +117,6 @@ def shown_specs(observation_spec: Composite) -> dict[str, TensorSpec]:
         if len(found) == 1 and key in observation_spec.keys():  # noqa: SIM118, no dict
             found[key] = observation_spec[key]
     return found
-
-
-def gated_network(specs: dict[str, TensorSpec], num_extra: int, num_outputs: int, **sizes: Any) -> GatedNetwork:
-    """Build a network that reads the keys of `shown_specs` and further inputs.
-
-    Args:
-        specs: of what it sees.
-    """
-    observation = specs["observation"]
-    num_ids = 0
-    if TASK_NUMBER in specs:
-        num_ids = int(specs[TASK_NUMBER].space.high) + 1
-    elif "task_id" in specs:
-        num_extra += specs["task_id"].shape.numel()
-    high = highest(observation)
-    return GatedNetwork(observation.shape, high, num_ids, num_extra, num_outputs=num_outputs, **sizes)
 
 
 def require_gated_weights(

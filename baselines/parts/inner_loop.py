@@ -34,7 +34,7 @@ from torch.nn.functional import one_hot
 from torchrl.data import Composite, TensorSpec
 from typing_extensions import override
 
-from baselines.parts.gates import GATES, GatedNetwork, gated_network, require_gated_weights, shown_specs
+from baselines.parts.gates import GATES, GatedNetwork, require_gated_weights, shown_specs
 from baselines.parts.learner import Learner
 from baselines.parts.networks import Data, Items, TensorsByName, draw, entropy, guided, is_greedy, num_actions_of
 from baselines.update.trust_region import trust_region_step
@@ -314,7 +314,7 @@ class InnerLoop(Learner):
         require_gated_weights(observation_spec, *hidden, num_context=self.num_context, gate_size=given.gate_size)
         self.specs = shown_specs(observation_spec)
         num_actions = num_actions_of(action_spec)
-        net = gated_network(
+        net = GatedNetwork(
             self.specs,
             self.num_context,
             num_actions,

@@ -16,6 +16,7 @@ from helpers.small_agents import (
     learnt_from,
     others_slow,
 )
+from torchrl.data import Bounded, Unbounded
 from torchrl.envs.utils import set_exploration_type
 
 from baselines.parts.gates import GatedNetwork
@@ -122,9 +123,18 @@ def test_an_agent_reads_the_task_id_where_the_environment_shows_it(compose, name
     assert changed == [True, True, False]
 
 
+GATED = {"hidden_size": 8, "num_layers": 2, "gate": "soft", "gate_size": 4}
+
+
+def seen_with(num_ids: int):
+    """What a network sees that reads so many ids."""
+    number = {"task_number": Bounded(-1, num_ids - 1, [1], dtype=torch.int64)} if num_ids else {}
+    return {"observation": Unbounded([12]), **number}
+
+
 NETWORKS = {
     "encoder": lambda num_ids, num_extra: Encoder(torch.Size([12]), 1.0, 8, num_extra=num_extra, num_ids=num_ids),
-    "gated": lambda num_ids, num_extra: GatedNetwork(torch.Size([12]), 1.0, num_ids, num_extra, 8, 2, 3, "soft", 4),
+    "gated": lambda num_ids, num_extra: GatedNetwork(seen_with(num_ids), num_extra, 3, **GATED),
 }
 
 
