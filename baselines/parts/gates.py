@@ -86,7 +86,9 @@ class GatedNetwork(nn.Module):
             num_ids = int(specs[TASK_NUMBER].space.high) + 1
         elif "task_id" in specs:
             num_extra += specs["task_id"].shape.numel()
-        first = GatedLayer(observation.shape.numel(), hidden_size, gate, gate_size, num_ids, num_extra)
+        first = GatedLayer(
+            observation.shape.numel(), hidden_size, gate, gate_size, num_ids=num_ids, num_extra=num_extra
+        )
         self.layers = nn.ModuleList([first])
         for _ in range(num_layers - 1):
             self.layers.append(GatedLayer(hidden_size, hidden_size, gate, gate_size))
