@@ -23,7 +23,6 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ctgraph_rl.batch.specs import TASK_NUMBER
 from ctgraph_rl.checks import Rule, fraction, require, takes_numbers
 from ctgraph_rl.core.graph import WAIT_ACTION, StateType
-from ctgraph_rl.core.rewards import Arrival
 from ctgraph_rl.learn.collect import PREVIOUS_ACTION, TRIAL, InitialState, Step
 from ctgraph_rl.learn.logits_policy import as_policy
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -31,7 +30,7 @@ from ctgraph_rl.tasks.exactness import INSTEAD, MOST_HISTORIES, count_histories,
 from ctgraph_rl.tasks.kinds.task_like import TaskLike
 from ctgraph_rl.tasks.memory import bank_key, make_bank
 from ctgraph_rl.tasks.task import Task, are_graphs
-from ctgraph_rl.tasks.values import Measures, policy_measures
+from ctgraph_rl.tasks.values import Measures, end_rewards, policy_measures
 
 HISTORIES_AT_ONCE = 2**15
 
@@ -290,7 +289,7 @@ class _Enumeration:
         self.task = seeds.shown.task
         self.gamma = gamma
         self.bank = seeds.shown.bank
-        self.paid = self._paid()
+        self.paid = end_rewards(self.task)
         self.stays = longest_stay(self.task.graph.wait_prob)
         zeros = torch.zeros(seeds.num_seeds, dtype=torch.float64, device="cpu")
         self.sums = {each.name: zeros.clone() for each in fields(Measures)}
@@ -301,13 +300,6 @@ class _Enumeration:
         state = {key: self.seeds.by_seed(value) for key, value in start.items()}
         self._at_home(_Histories(torch.zeros(1, dtype=torch.int64, device="cpu"), weight, ones, state))
         return [Measures(*values) for values in torch.stack([*self.sums.values()], dim=1).tolist()]
-
-    def _paid(self) -> Tensor:
-        graph = self.task.graph
-        leaf = torch.arange(graph.num_end_states, device="cpu")
-        sizes = (torch.full_like(leaf, graph.branching_factor), torch.full_like(leaf, graph.depth))
-        arrival = Arrival(leaf, torch.full_like(leaf, self.task.goal_leaf), *sizes, graph.depth)
-        return self.task.goal_reward * self.task.reward_fn(arrival).double()
 
     def _at_home(self, histories: _Histories) -> None:
         seen, probs, written = self._act(histories, StateType.HOME, 0, is_init=True)

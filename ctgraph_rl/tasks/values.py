@@ -259,6 +259,17 @@ def _value_at_home(tree: _EveryNode | _GoalPath, chooser: BestActions | _Memoryl
     return tree.task.step_reward + chooser.gamma * values[..., 0]
 
 
+def end_rewards(task: Task) -> Tensor:
+    """What each end state pays, float64 [b^d]."""
+    graph = task.graph
+    leaf = torch.arange(graph.num_end_states, device="cpu")
+    goal = torch.full_like(leaf, task.goal_leaf)
+    b = torch.full_like(leaf, graph.branching_factor)
+    depth = torch.full_like(leaf, graph.depth)
+    share = task.reward_fn(Arrival(leaf, goal, b, depth, graph.depth))
+    return task.goal_reward * share.to(torch.float64)
+
+
 def smallest_tree(task: Task, collapses: bool) -> _EveryNode | _GoalPath:
     """The smallest tree that is exact."""
     if collapses:
@@ -275,14 +286,7 @@ class _EveryNode:
     task: Task
 
     def end_rewards(self) -> Tensor:
-        task = self.task
-        graph = task.graph
-        leaf = torch.arange(graph.num_end_states, device="cpu")
-        goal = torch.full_like(leaf, task.goal_leaf)
-        b = torch.full_like(leaf, graph.branching_factor)
-        depth = torch.full_like(leaf, graph.depth)
-        share = task.reward_fn(Arrival(leaf, goal, b, depth, graph.depth))
-        return task.goal_reward * share.to(torch.float64)
+        return end_rewards(self.task)
 
     def children(self, values: Tensor, level: int) -> Tensor:
         """By parent and decision: float64 [..., b^level, b]."""
