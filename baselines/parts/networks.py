@@ -271,28 +271,24 @@ class RecurrentModule(TensorDictModuleBase):
 
     def number_histories(self, data: Data) -> Items:
         """Number the inputs and the histories of frames from 0; int64 [rows, steps] each."""
-        seen, own = self._read(data)
         starts = data["is_init"].squeeze(-1)
-        _, groups = distinct([*seen, *own])
-        inputs = groups.view_as(starts)
+        inputs = self.input_groups(data).view_as(starts)
         state = [data[key][:, 0] for key in self.state_keys]
         return {INPUT: inputs, HISTORY: histories.number_histories(inputs, starts, state)}
 
     def input_groups(self, data: Data) -> Tensor:
         """Return the number of each frame's inputs, of which the encoder reads different ones once, [rows * steps]."""
-        if INPUT in data:
-            return renumber(data[INPUT].flatten())[1]
-        seen, own = self._read(data)
-        return distinct([*seen, *own])[1]
+        return self._read(data)[3]
 
-    def _read(self, data: Data) -> tuple[list[Tensor], list[Tensor]]:
+    def _read(self, data: Data) -> tuple[list[Tensor], list[Tensor], Tensor, Tensor]:
         seen = [data[key].flatten(0, 1) for key in self.encoder.in_keys]
-        return seen, [value.flatten(0, 1) for value in self._own(data)]
+        own = [value.flatten(0, 1) for value in self._own(data)]
+        examples, groups = renumber(data[INPUT].flatten()) if INPUT in data else distinct([*seen, *own])
+        return seen, own, examples, groups
 
     def _sequences(self, data: Data) -> tuple[Tensor, Tensor, Tensor, CellState]:
         starts = data["is_init"].squeeze(-1)
-        seen, own = self._read(data)
-        examples, groups = renumber(data[INPUT].flatten()) if INPUT in data else distinct([*seen, *own])
+        seen, own, examples, groups = self._read(data)
         features = self.encoder.module(*(value.index_select(0, examples) for value in seen))
         inputs = joined(features, *(value.index_select(0, examples) for value in own))
         state = reset([data[key][:, 0] for key in self.state_keys], starts[:, 0])
@@ -409,11 +405,6 @@ def recurrent(
     return RecurrentModule(encoder(observation_spec, num_features, num_layers, kind=kind, **extra), cell)
 
 
-def linear(in_key: str, num_features: int, out_key: str, num_outputs: int) -> TensorDictModule:
-    """Build a linear layer from ``in_key`` to ``out_key``."""
-    return TensorDictModule(linear_layer(num_features, num_outputs), in_keys=[in_key], out_keys=[out_key])
-
-
 def make_orthogonal(trunk: nn.Module, *heads: nn.Module) -> None:
     """Initialise linear layers with orthogonal weights, a thousand times smaller in heads, and biases of 0.
 
@@ -429,7 +420,7 @@ def make_orthogonal(trunk: nn.Module, *heads: nn.Module) -> None:
 def actor(in_key: str, num_features: int, action_spec: TensorSpec) -> ProbabilisticActor:
     """Build a categorical policy of features; writes ``action`` and ``action_log_prob``."""
     return ProbabilisticActor(
-        linear(in_key, num_features, "logits", num_actions_of(action_spec)),
+        TensorDictModule(linear_layer(num_features, num_actions_of(action_spec)), [in_key], ["logits"]),
         spec=action_spec,
         in_keys=["logits"],
         distribution_class=torch.distributions.Categorical,

@@ -58,19 +58,7 @@ def require_replay(observation_spec: Composite, buffer_size: int, batch_size: in
 
 
 class Exploration(EGreedyModule):
-    """TorchRL's epsilon-greedy exploration for whole numbers, float32 on the CPU.
-
-    Args:
-        action_spec: the actions to draw from.
-        eps_init: probability of a random action at the start.
-        eps_end: probability after ``num_steps``.
-        num_steps: steps over which it falls linearly.
-    """
-
-    def __init__(self, action_spec: TensorSpec, eps_init: float, eps_end: float, num_steps: int) -> None:
-        super().__init__(action_spec, eps_init, eps_end, num_steps)
-        for name, value in (("eps_init", eps_init), ("eps_end", eps_end), ("eps", eps_init)):
-            setattr(self, name, torch.tensor(value, dtype=torch.float32, device="cpu"))
+    """TorchRL's epsilon-greedy exploration for whole numbers."""
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Replace some actions by random ones, unless actions are greedy."""
@@ -203,7 +191,8 @@ class QLearner(Learner):
             state: from `state_written`.
         """
         eps = float(self.settings.eps_init), float(self.settings.eps_end)
-        self.exploration = Exploration(action_spec, *eps, self.annealing_batches)
+        with torchs_defaults():
+            self.exploration = Exploration(action_spec, *eps, self.annealing_batches)
         self.policy = EpsilonGreedy(greedy, self.exploration)
         self.policy.out_keys = ["action", *state]
         self.greedy = greedy

@@ -153,7 +153,12 @@ class SeedGroup:
         if self._acting is None:
             self._acting = Stack(self.learners)
         outputs = self._act(self._acting, {key: self.by_seed(data[key]) for key in keys})
-        return self._explored(outputs) if "action_value" in outputs else self._sampled(outputs)
+        if "action_value" in outputs:
+            return self._explored(outputs)
+        noise = torch.empty_like(outputs["log_probs"], memory_format=torch.contiguous_format)
+        for row, generator in zip(noise, self.generators, strict=True):
+            row.exponential_(generator=generator)
+        return sampled(outputs, noise)
 
     def _acted_in_turn(self, data: Items) -> Items:
         written = []
@@ -177,12 +182,6 @@ class SeedGroup:
         if graph.code not in self._compiled:
             self._compiled[graph.code] = compile(graph, [*inputs], compiler_options())
         return self._compiled[graph.code]
-
-    def _sampled(self, outputs: Mapping[str, Tensor]) -> TensorsByName:
-        noise = torch.empty_like(outputs["log_probs"], memory_format=torch.contiguous_format)
-        for row, generator in zip(noise, self.generators, strict=True):
-            row.exponential_(generator=generator)
-        return sampled(outputs, noise)
 
     def _explored(self, outputs: Mapping[str, Tensor]) -> TensorsByName:
         actions = outputs["action_value"].argmax(dim=-1)
