@@ -53,7 +53,8 @@ def optimal_value(task: Task, gamma: float) -> float:
         0.59049
     """
     require(*fraction(gamma=gamma))
-    return _value_at_home(smallest_tree(task, is_needle(task)), BestActions(task, gamma)).item()
+    tree = _GoalAndAnother(task) if is_needle(task) else smallest_tree(task, False)
+    return _value_at_home(tree, BestActions(task, gamma)).item()
 
 
 def worst_value(task: Task, gamma: float) -> float:
@@ -316,6 +317,14 @@ class _GoalPath:
         children = values[..., 1:, None].expand(*values.shape, self.task.graph.branching_factor).clone()
         children[..., 0, self.task.goal_decisions[level] - 1] = values[..., 0]
         return children
+
+
+class _GoalAndAnother(_GoalPath):
+    """With two of the b decisions, enough for a best choice."""
+
+    def children(self, values: Tensor, level: int) -> Tensor:
+        """By parent, for the goal's decision and any other: float64 [2, 2]."""
+        return torch.stack([values, values[1].repeat(2)])
 
 
 @dataclass(frozen=True)
