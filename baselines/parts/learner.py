@@ -116,10 +116,6 @@ class Learner(TakesNumbers, Trained):
         """
         raise NotImplementedError
 
-    def one_step(self, data: Data) -> Items:
-        """Return `outputs` for one step of all rows, and with memory the next state under ``("next", key)``."""
-        return dict(self.outputs(data))
-
     @property
     def tells_units(self) -> bool:
         """Whether its hidden layers are known."""

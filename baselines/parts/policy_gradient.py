@@ -150,8 +150,8 @@ class PolicyGradient(Learner):
     def outputs(self, data: Data) -> TensorsByName:
         return self.policy.outputs(data)
 
-    @override
     def one_step(self, data: Data) -> Items:
+        """Return `outputs` for one step of all rows, and with memory the next state under ``("next", key)``."""
         return self.policy.one_step(data)
 
     def minibatches(self, batch: TensorDictBase) -> Iterator[Items]:

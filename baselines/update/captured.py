@@ -22,7 +22,7 @@ from baselines.parts.policy_gradient import PolicyGradient, Seeds
 from baselines.update.measured import finite_means, table_of
 from baselines.update.seeds import SeedGroup, has_stackable, learner_of, or_error, sampled, why_not_step, write_rows
 from baselines.update.stack import Stack
-from baselines.update.update import update, usual_update
+from baselines.update.update import over_seeds, update, usual_update
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.core import philox
 from ctgraph_rl.core.region import Region
@@ -179,23 +179,26 @@ class CapturedGroup(SeedGroup):
 
     @override
     def acted(self, data: TensorDictBase, greedy: bool = False) -> Items:
-        keys = self.first.trunk.in_keys
-        written = self.stack.one_step({key: self.by_seed(data[key]) for key in keys})
+        written = self.one_step(data)
         log_probs = written.pop("log_probs")
         if greedy:
             written["action"] = log_probs.argmax(dim=-1)
         else:
             noise = self.draws.exponential(log_probs[0].numel()).view_as(log_probs)
             written |= sampled({"log_probs": log_probs, "state_value": written["state_value"]}, noise)
-        if PREVIOUS_ACTION in keys:
+        if PREVIOUS_ACTION in self.first.trunk.in_keys:
             written["next", PREVIOUS_ACTION] = written["action"]
         return written
 
+    def one_step(self, data: Data) -> Items:
+        """Return `PolicyGradient.one_step` of all agents, [seeds, num_envs, ...] each."""
+        inputs = {key: self.by_seed(data[key]) for key in self.first.trunk.in_keys}
+        return over_seeds(self.first, lambda learner, weights, data: learner.one_step(data), self.stack.state, inputs)
+
     def action_probs(self, data: Items) -> tuple[Tensor, Items]:
         """Return action probabilities of all rows and the next state, as `ctgraph_rl.agent.Agent`."""
-        device = self.draws.tick.device
-        inputs = {key: self.by_seed(data[key].to(device)) for key in self.first.trunk.in_keys}
-        written = {key: value.flatten(0, 1) for key, value in self.stack.one_step(inputs).items()}
+        inputs = {key: value.to(self.draws.tick.device) for key, value in data.items()}
+        written = {key: value.flatten(0, 1) for key, value in self.one_step(inputs).items()}
         chances = written.pop("log_probs").softmax(dim=-1)
         return most_likely(chances) if is_greedy() else chances, written
 
@@ -233,8 +236,7 @@ class CapturedGroup(SeedGroup):
         return Seeds(len(self.learners), self._values, self.draws.orders)
 
     def _values(self, data: Items) -> Tensor:
-        written = self.stack.one_step({key: self.by_seed(value) for key, value in data.items()})
-        return written["state_value"].flatten(0, 1)
+        return self.one_step(data)["state_value"].flatten(0, 1)
 
     def _transformed(self, minibatch: TensorsByName) -> TensorsByName:
         if not self.methods:

@@ -168,7 +168,7 @@ class SeedGroup:
         return {key: torch.stack([each[key] for each in written]) for key in written[0]}
 
     def _act(self, stack: Stack, data: Items) -> TensorsByName:
-        """Return `Stack.outputs` by a graph of its operations, compiled where the agents set it.
+        """Return the networks' outputs by a graph of operations, compiled where the agents set it.
 
         Binding tensors and gaps between operations would take most of the time.
         """

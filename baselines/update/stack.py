@@ -111,20 +111,15 @@ class Stack:
     def _named(self, kept: TensorsByName) -> TensorsByName:
         return {name: kept[first] for name, first in self.first_name.items()}
 
-    def outputs(self, data: Items) -> TensorsByName:
-        """Return the outputs of all networks for one step of all rows, [seeds, num_envs, n] each."""
-        return over_seeds(self.learners[0], _outputs, self.state, data)
-
-    def one_step(self, data: Items) -> Items:
-        """Return `Learner.one_step` of all learners, [seeds, num_envs, ...] each."""
-        return over_seeds(self.learners[0], lambda learner, weights, data: learner.one_step(data), self.state, data)
-
     def acting_inputs(self, data: Items) -> list[Tensor]:
-        """Return the tensors that `outputs` reads, in a fixed order."""
+        """Return the tensors that `traced_outputs` reads, in a fixed order."""
         return [*(tensor.detach() for tensor in self.kept.values()), *data.values()]
 
     def traced_outputs(self, data: Items) -> GraphModule:
-        """Return `outputs` as a graph of operations, a function of `acting_inputs`."""
+        """Return a graph of operations, a function of `acting_inputs`.
+
+        It returns the outputs of all networks for one step of all rows, [seeds, num_envs, n] each.
+        """
         state = self.state
 
         def outputs(*given: Tensor) -> TensorsByName:
