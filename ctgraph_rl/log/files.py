@@ -128,7 +128,10 @@ class Locks:
         try:
             if not self._file.closed:  # as a fork's is
                 for path, content in self._others.items():
-                    if _has(path, content):
+                    found = b""
+                    with suppress(OSError, ValueError):
+                        found = read_regular(path, MOST_BYTES_OF_A_REASON)
+                    if found == content:
                         path.unlink(missing_ok=True)
                 if _is_still_there(self._file, self._path):
                     self._path.unlink(missing_ok=True)
@@ -166,13 +169,6 @@ def _is_held_elsewhere(file: BinaryIO, path: Path) -> bool:
         with open_own(path.parent / os.fsdecode(name), "rb+") as other:
             return _read(other) == signature and not _is_locked(other)
     except (FileNotFoundError, NotADirectoryError):
-        return False
-
-
-def _has(path: Path, content: bytes) -> bool:
-    try:
-        return read_regular(path, MOST_BYTES_OF_A_REASON) == content
-    except (OSError, ValueError):
         return False
 
 

@@ -139,24 +139,17 @@ def short(name: str) -> str:
     return figure_text(name if len(name) <= LONGEST_NAME else f"{name[: half - 1]}…{name[-half:]}")
 
 
-def contrast(one: Sequence[float], other: Sequence[float]) -> float:
-    """Return the contrast ratio of two colours, 1 to 21, by the Web Content Accessibility Guidelines 2.2.
+def ink(background: Sequence[float]) -> str:
+    """Return black or white as the colour of text on a background, whichever has more contrast, at least 4.5.
+
+    Contrast is that of the Web Content Accessibility Guidelines 2.2.
 
     Args:
-        one: red, green and blue of sRGB, each in [0, 1].
+        background: red, green and blue of sRGB, each in [0, 1].
     """
-    dark, light = sorted((_luminance(one), _luminance(other)))
-    return (light + 0.05) / (dark + 0.05)
-
-
-def _luminance(colour: Sequence[float]) -> float:
-    linear = [value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4 for value in colour]
-    return sum(weight * value for weight, value in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
-
-
-def ink(background: Sequence[float]) -> str:
-    """Return black or white as the colour of text on a background, with a contrast of at least 4.5."""
-    return "black" if contrast(background, (0, 0, 0)) >= contrast(background, (1, 1, 1)) else "white"
+    linear = [value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4 for value in background]
+    luminance = sum(weight * value for weight, value in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
+    return "black" if (luminance + 0.05) ** 2 >= 1.05 * 0.05 else "white"
 
 
 def frames_axis(axes: Any) -> None:

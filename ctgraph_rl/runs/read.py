@@ -277,13 +277,8 @@ def find_runs(
     if tuning:
         return list(runs.values()), problems
     is_tuning = split_by(runs.values(), lambda run: tuning_share(run.about) is not None)
-    return is_tuning.get(False, []), [*problems, *_tuning_notes(is_tuning.get(True, []))]
-
-
-def _tuning_notes(runs: Sequence[Run]) -> Iterator[Problem]:
-    for (name, agent, share), some in split_by(
-        runs, lambda run: (run.group[0], run.agent, tuning_share(run.about))
-    ).items():
+    tuned = split_by(is_tuning.get(True, ()), lambda run: (run.group[0], run.agent, tuning_share(run.about)))
+    for (name, agent, share), some in tuned.items():
         trials = len({run.alike for run in some})
         seeds = listed(sorted({run.seed for run in some}), MOST_SEEDS)
         runs_of = f"{len(some)} tuning run{'s' * (len(some) > 1)} of {agent} on {name}"
@@ -291,7 +286,8 @@ def _tuning_notes(runs: Sequence[Run]) -> Iterator[Problem]:
         ends = {max(value.frames or 0 for value in run.values) for run in some if run.values}
         ended = f", ended after {listed(sorted(ends), MOST_SEEDS)} frames" if ends else ""
         reason = f"{what}, objective_until={share:g}{ended}; --tuning, in Python tuning=True, shows them"
-        yield Problem(some[0].path, reason, is_error=False)
+        problems.append(Problem(some[0].path, reason, is_error=False))
+    return is_tuning.get(False, []), problems
 
 
 def read_run(path: Path) -> Run:

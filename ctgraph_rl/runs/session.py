@@ -244,9 +244,13 @@ class OneBatch(SessionCoupling):
             each.checkpoints.tidy()
         begun = [each for each in members if each.checkpoints.files()]
         saved = newest_of_all([each.checkpoints for each in members])
-        rules = [_same_group(each) for each in begun]
-        if len(begun) < len(members):
-            rules = [_all_begun(each, begun) for each in members if each not in begun]
+        named = ", ".join(str(each.run_dir) for each in begun)
+        rules = []
+        for each in members:
+            if each not in begun:
+                lost = f"{each.run_dir} has lost its checkpoints, and learns as one batch with {named}, which have some"
+                rules.append((not begun, f"{lost}: restore them, or start all again with overwrite=true"))
+        rules = rules or [_same_group(each) for each in begun]
         can_resume = saved is not None and (
             saved[0]["frames"] >= curriculum.frames_of(self.until) or all(rule for rule, _ in rules)
         )
@@ -312,12 +316,6 @@ def _same_group(member: RunMember) -> Rule:
     how = "together=true and seed=" + ",".join(map(str, before)) if before else "together=false"
     began = f"{member.run_dir} was begun {f'with the seeds {before} together' if before else 'by itself'}"
     return before == list(member.together), f"{began}: resume it with {how}, or start again with overwrite=true"
-
-
-def _all_begun(member: RunMember, others: Sequence[RunMember]) -> Rule:
-    named = ", ".join(str(each.run_dir) for each in others)
-    lost = f"{member.run_dir} has lost its checkpoints, and learns as one batch with {named}, which have some"
-    return not others, f"{lost}: restore them, or start all again with overwrite=true"
 
 
 def why_agents_learn_alone(agent: object, device: torch.device) -> str | None:

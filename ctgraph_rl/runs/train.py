@@ -10,7 +10,7 @@ from torchrl.data import Composite, TensorSpec
 
 from ctgraph_rl.agent import Agent, MethodLike, PlasticityLike
 from ctgraph_rl.batch.rows import seed_rule
-from ctgraph_rl.checks import Rule, require, require_memory
+from ctgraph_rl.checks import require, require_memory
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.learn.collect import agent_specs
 from ctgraph_rl.learn.refusals import check_learner
@@ -43,7 +43,17 @@ def new_agent(curriculum: Curriculum, make_agent: MakeAgent, seed: int, device: 
     device = checked_device(device)
     torch.manual_seed(seed)
     specs = agent_specs(curriculum)
-    require(_takes_specs(make_agent))
+    try:
+        signature(make_agent).bind(None, None)
+        if isinstance(make_agent, type):
+            parameters = sorted(parameters_of(make_agent).values(), key=lambda each: each.kind)
+            Signature(parameters).bind(None, None)
+    except TypeError as error:
+        name = getattr(make_agent, "__name__", type(make_agent).__name__)
+        two = f"make_agent must take two specs and nothing else, {name}: {error}; bind the rest, by partial"
+        raise ValueError(two) from None
+    except ValueError:  # what has no signature
+        pass
     agent: Agent = make_agent(*specs)
     missing = [name for name in MEMBERS if not hasattr(agent, name)]
     name = getattr(agent, "__name__", type(agent).__name__)
@@ -56,20 +66,6 @@ def new_agent(curriculum: Curriculum, make_agent: MakeAgent, seed: int, device: 
     agent = agent.to(device)
     check_learner(curriculum, agent)
     return agent
-
-
-def _takes_specs(make_agent: Callable[..., object]) -> Rule:
-    try:
-        signature(make_agent).bind(None, None)
-        if isinstance(make_agent, type):
-            parameters = sorted(parameters_of(make_agent).values(), key=lambda each: each.kind)
-            Signature(parameters).bind(None, None)
-    except TypeError as error:
-        name = getattr(make_agent, "__name__", type(make_agent).__name__)
-        return False, f"make_agent must take two specs and nothing else, {name}: {error}; bind the rest, by partial"
-    except ValueError:  # what has no signature
-        pass
-    return True, ""
 
 
 def with_method(

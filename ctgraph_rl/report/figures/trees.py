@@ -51,9 +51,17 @@ def draw_trees(trees: Trees, seed: int) -> Any:
     assert trees.curriculum is not None
     tasks = list(zip(ct_graphs(trees.curriculum.tasks[:MOST_TREES], "a tree"), trees.curriculum.labels, strict=False))
     deepest = max(task.graph.depth for task, _ in tasks)
+    per_row = trees.curriculum.evaluation.episodes_per_row
+    episodes = per_row * math.ceil(EPISODES / per_row)
     grid = panels(len(tasks), COLUMNS, min(0.4 * (2 * deepest + 4), 5.0), room=0)
     for axes, (task, label) in zip(grid.ravel(), tasks, strict=False):
-        seen = Visits({}, {}) if trees.trained is None else _visits(trees.trained, task, seed)
+        seen = Visits({}, {})
+        if trees.trained is not None:
+            agent = trees.trained.agent
+            policy = trees.trained.policy_for(task)
+            seen = visits(
+                task, policy, agent.initial_state, episodes, seed, episodes_per_row=per_row, curriculum=trees.curriculum
+            )
         draw_task(axes, task, seen.counts, seen.actions, ids=False, legend=task is tasks[-1][0])
         axes.set_title(f"{short(label)}\n{axes.get_title()}")
     return grid[0, 0].figure
@@ -75,12 +83,3 @@ def find_trees(run: Run) -> Trees:
     except Exception as error:  # files of others fail in any way; the report says why
         return Trees(curriculum, None, " ".join(str(error).split()).rstrip(". ") or type(error).__name__)
     return Trees(trained.curriculum, trained, "")
-
-
-def _visits(trained: Trained, task: Any, seed: int) -> Visits:
-    curriculum = trained.curriculum
-    state = trained.agent.initial_state
-    per_row = curriculum.evaluation.episodes_per_row
-    episodes = per_row * math.ceil(EPISODES / per_row)
-    policy = trained.policy_for(task)
-    return visits(task, policy, state, episodes, seed, episodes_per_row=per_row, curriculum=curriculum)

@@ -22,7 +22,7 @@ from ctgraph_rl.report.figures import heatmaps
 from ctgraph_rl.report.figures.heatmaps import draw_matrices
 from ctgraph_rl.report.figures.labels import label_strips
 from ctgraph_rl.report.figures.learning_curves import learning_curves, mean_curves, training_curves, unit_curves
-from ctgraph_rl.report.style import contrast, ink, style
+from ctgraph_rl.report.style import ink, style
 from ctgraph_rl.report.terminal import label_notes
 
 
@@ -34,17 +34,15 @@ def section(tmp_path):
     return sections(find_runs([tmp_path])[0])[0]
 
 
-@pytest.mark.parametrize(
-    ("one", "other", "ratio"),
-    [
-        ((0, 0, 0), (1, 1, 1), 21),
-        ((1, 0, 0), (1, 1, 1), 3.998),
-        ((0x76 / 255,) * 3, (1, 1, 1), 4.542),
-        ((0, 0, 1), (0, 0, 0), 2.444),
-    ],
-)
-def test_contrast_is_that_of_the_web_guidelines(one, other, ratio):
-    assert contrast(one, other) == contrast(other, one) == pytest.approx(ratio, abs=1e-3)
+def contrast(one, other) -> float:
+    """The contrast ratio of two colours, by the Web Content Accessibility Guidelines 2.2."""
+    dark, light = sorted(map(luminance, (one, other)))
+    return (light + 0.05) / (dark + 0.05)
+
+
+def luminance(colour) -> float:
+    red, green, blue = [each / 12.92 if each <= 0.04045 else ((each + 0.055) / 1.055) ** 2.4 for each in colour]
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue
 
 
 def test_without_returns_of_training_there_is_no_figure_of_them(section, tmp_path):
