@@ -88,15 +88,12 @@ class RecurrentQ(QLearner):
 
     @override
     def values(self, data: Data) -> Tensor:
-        return self._head(data)[0]
+        return self.quantiles(data).mean(dim=-1)
 
     def quantiles(self, data: Data) -> Tensor:
         """Return the network's quantiles, [B, L, A, K]."""
-        return self._head(data)[1]
-
-    def _head(self, data: Data) -> tuple[Tensor, Tensor]:
         head = self.greedy.module[0].module[1]
-        return head.module(self.trunk.over_time(data))
+        return head.module(self.trunk.over_time(data))[1]
 
     @override
     def num_items(self, num_steps: int) -> int:

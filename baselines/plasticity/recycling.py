@@ -39,30 +39,25 @@ class Recycling(Plasticity):
             means: of their activations, which the biases of what reads them take over; None: nothing is taken over.
         """
         count = int(torch.cat(list(chosen)).sum())
-        if count:
-            with self.rewriting():
-                if means is not None:
-                    self._move_on(chosen, means)
-                self._renew(chosen)
-                for layer, units in zip(self.layers, chosen, strict=True):
+        if not count:
+            return 0
+        with self.rewriting():
+            if means is not None:
+                for layer, units, mean in zip(self.layers, chosen, means, strict=True):
                     for reader in layer.readers:
-                        self._set(reader.weight, (slice(None), reader.columns[units].flatten()), 0.0)
+                        moved = reader.weight[:, reader.columns[units]] * mean[units].unsqueeze(-1)
+                        reader.bias.add_(moved.sum(dim=(1, 2)))
+            drawn = self.draw_weights()
+            for layer, units in zip(self.layers, chosen, strict=True):
+                self._set(layer.linear.weight, units, drawn[layer.linear.weight][units])
+                self._set(layer.linear.bias, units, 0.0)
+                if layer.norm is not None:
+                    self._set(layer.norm.weight, units, 1.0)
+                    self._set(layer.norm.bias, units, 0.0)
+            for layer, units in zip(self.layers, chosen, strict=True):
+                for reader in layer.readers:
+                    self._set(reader.weight, (slice(None), reader.columns[units].flatten()), 0.0)
         return count
-
-    def _move_on(self, chosen: Sequence[Tensor], means: Sequence[Tensor]) -> None:
-        for layer, units, mean in zip(self.layers, chosen, means, strict=True):
-            for reader in layer.readers:
-                moved = reader.weight[:, reader.columns[units]] * mean[units].unsqueeze(-1)
-                reader.bias.add_(moved.sum(dim=(1, 2)))
-
-    def _renew(self, chosen: Sequence[Tensor]) -> None:
-        drawn = self.draw_weights()
-        for layer, units in zip(self.layers, chosen, strict=True):
-            self._set(layer.linear.weight, units, drawn[layer.linear.weight][units])
-            self._set(layer.linear.bias, units, 0.0)
-            if layer.norm is not None:
-                self._set(layer.norm.weight, units, 1.0)
-                self._set(layer.norm.bias, units, 0.0)
 
     def _set(self, parameter: Tensor, index: Any, value: Tensor | float) -> None:
         parameter[index] = value

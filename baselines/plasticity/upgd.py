@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from baselines.parts.learner import Learner
-from baselines.plasticity.plasticity import STREAM, Plasticity
+from baselines.plasticity.plasticity import Plasticity
 from ctgraph_rl.checks import is_real, not_negative, one_of, positive, require
 
 FORMS = ("adam", "sgd")
@@ -68,8 +68,7 @@ class UPGD(Plasticity):
         compiled = "UPGD is an optimiser of Python, which a compiled step cannot take: set agent.compile=false"
         require((agent.compiled_step is None, compiled))
         rate = agent.optimiser.defaults["lr"]
-        seed = (torch.initial_seed() ^ STREAM << 32) % 2**63
-        agent.optimiser = self.make_optimiser(agent.trainable, lr=rate, seed=seed)
+        agent.optimiser = self.make_optimiser(agent.trainable, lr=rate, seed=self.generator.initial_seed())
 
 
 class UPGDOptimiser(torch.optim.Optimizer):

@@ -148,24 +148,22 @@ class SeedGroup:
     def acted(self, data: TensorDictBase) -> Items:
         """Return what the policies write, [seeds, num_envs, ...] each."""
         keys = [key for key in self.first.policy.in_keys if key in data.keys()]  # noqa: SIM118, rows otherwise
+        inputs = {key: self.by_seed(data[key]) for key in keys}
         if self.first.memory:
-            return self._acted_in_turn({key: self.by_seed(data[key]) for key in keys})
+            written = []
+            for number, learner in enumerate(self.learners):
+                with self.random(number):
+                    written.append(learner.policy.act_on_tensors({key: value[number] for key, value in inputs.items()}))
+            return {key: torch.stack([each[key] for each in written]) for key in written[0]}
         if self._acting is None:
             self._acting = Stack(self.learners)
-        outputs = self._act(self._acting, {key: self.by_seed(data[key]) for key in keys})
+        outputs = self._act(self._acting, inputs)
         if "action_value" in outputs:
             return self._explored(outputs)
         noise = torch.empty_like(outputs["log_probs"], memory_format=torch.contiguous_format)
         for row, generator in zip(noise, self.generators, strict=True):
             row.exponential_(generator=generator)
         return sampled(outputs, noise)
-
-    def _acted_in_turn(self, data: Items) -> Items:
-        written = []
-        for number, learner in enumerate(self.learners):
-            with self.random(number):
-                written.append(learner.policy.act_on_tensors({key: value[number] for key, value in data.items()}))
-        return {key: torch.stack([each[key] for each in written]) for key in written[0]}
 
     def _act(self, stack: Stack, data: Items) -> TensorsByName:
         """Return the networks' outputs by a graph of operations, compiled where the agents set it.

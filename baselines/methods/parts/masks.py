@@ -79,7 +79,14 @@ class Masks(TaskMethod):
     @torch.no_grad()
     def initial_scores(self) -> list[Tensor]:
         """Draw random scores, float32 [n] of each weight tensor."""
-        return [_drawn_scores(parameter).flatten() for parameter in self.weights.parameters]
+        found = []
+        for parameter in self.weights.parameters:
+            scores = torch.zeros_like(parameter)
+            if parameter.ndim > 1:
+                most = parameter[0].numel() ** -0.5
+                scores.uniform_(-most, most)
+            found.append(scores.flatten())
+        return found
 
     def current_scores(self) -> Sequence[Tensor]:
         """Return the present mask's scores, float32 [n] of each weight tensor, from the trained parameters."""
@@ -184,10 +191,3 @@ def _signed_constant(parameter: Tensor) -> Tensor:
     if parameter.ndim < 2:
         return torch.zeros_like(parameter)
     return parameter.sign() * (2 / parameter[0].numel()) ** 0.5
-
-
-def _drawn_scores(parameter: Tensor) -> Tensor:
-    if parameter.ndim < 2:
-        return torch.zeros_like(parameter)
-    most = parameter[0].numel() ** -0.5
-    return torch.empty_like(parameter).uniform_(-most, most)
