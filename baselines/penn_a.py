@@ -322,7 +322,12 @@ class PennASettings(Reproduction):
             *positive(learning_rate=self.learning_rate, precision=self.precision),
         )
         rows = f"num_envs must be a multiple of num_trials={self.num_trials}, the rows of an individual"
-        require((self.num_envs % self.num_trials == 0, f"{rows}, got {self.num_envs}"))
+        fewest = self.segment_size * self.num_trials
+        segment = f"num_envs must be at least segment_size={self.segment_size} individuals, {fewest} rows"
+        require(
+            (self.num_envs % self.num_trials == 0, f"{rows}, got {self.num_envs}"),
+            (self.num_envs >= fewest, f"{segment}, got {self.num_envs}"),
+        )
 
 
 class PennA(TensorDictModuleBase):

@@ -42,7 +42,7 @@ RUNS: dict[str, list[str]] = {path.stem: BLOCKS for path in CONF.glob("*.yaml") 
     "dqn": [*BLOCKS, *REPLAY, "agent.priority_alpha=0.6"],
     "drqn": [*BLOCKS, *REPLAY],
     "lstm_ppo": [*BLOCKS, *MINIBATCHES, "protocol.task_id=one_hot"],
-    "penn_a": [*BLOCKS, "agent.num_batches=2", "agent.num_updates=2"],
+    "penn_a": [*BLOCKS, "agent.num_batches=2", "agent.num_updates=2", "agent.segment_size=2"],
     "ppo": [*BLOCKS, *MINIBATCHES, "protocol.task_id=at_boundaries"],
     "ppo_count": [*BLOCKS, *MINIBATCHES],
     "qrdqn_lstm": [*BLOCKS, *REPLAY, "agent.replay_on_task_change=keep", "protocol.boundaries=hidden"],

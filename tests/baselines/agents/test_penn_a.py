@@ -384,6 +384,7 @@ def test_best_search_and_memory_score_96_5_at_depth_2_and_92_5_at_depth_3():
     ("changes", "message"),
     [
         ({"num_trials": 3}, "num_envs must be a multiple of num_trials=3, the rows of an individual, got 16"),
+        ({"num_envs": 8}, "num_envs must be at least segment_size=5 individuals, 10 rows, got 8"),
         ({"insert_prob": 1.5}, "insert_prob must be "),
         ({"at": replace(ONE, graph=CTGraph(3, 1))}, "one neuron for the actions 0, 1 and 2, and the task has 4"),
     ],
