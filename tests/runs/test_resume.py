@@ -26,7 +26,13 @@ from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift
 AGENTS: dict[str, tuple[str, list[str]]] = {name: (name, less(name)) for name in NAMES} | {
     "a2c": ("a2c", ["agent.optimiser=rmsprop"]),
     "ppo_count": ("ppo_count", [*MINIBATCHES, "agent.num_hash_bits=6"]),
-    "penn_a": ("penn_a", ["agent.num_trials=2", "agent.num_batches=2", "agent.num_updates=2", "agent.insert_prob=0.5"]),
+    "penn_a": (
+        "penn_a",
+        [
+            *("agent.num_trials=2", "agent.segment_size=2", "agent.num_batches=2", "agent.num_updates=2"),
+            "agent.insert_prob=0.5",
+        ],
+    ),
     "prioritized dqn": ("dqn", [*REPLAY, "agent.priority_alpha=0.6", "agent.replay_on_task_change=keep"]),
     "qrdqn_lstm": ("qrdqn_lstm", [*REPLAY, "agent.num_quantiles=4"]),
     "rl2": ("rl2", [*MINIBATCHES, "agent.trial_episodes=4"]),
