@@ -5,7 +5,7 @@ Scores are computed from the logs; no code of the submission runs. Only a rerun 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
@@ -90,32 +90,22 @@ def scores_of(submission: Submission, run: SubmittedRun) -> dict[str, float | No
 
 def _of_the_whole(submission: Submission) -> Iterator[Check]:
     method = submission.method
+    curriculum = submission.curriculum
     runs = submission.runs
     of_track = submission.track
-    named = None if of_track is None else of_track.name
-    yield equal("track", method["track"], named)
     if of_track is not None:
         yield equal("version of the track", track_version(method), of_track.version)
-    found = submission.curriculum.fingerprint
-    wanted = "the published one" if of_track is None else f"one of track {of_track.id}"
-    yield _rules("curriculum", [curriculum_rule(submission.curriculum, of_track)], wanted, found)
-    seeds = [run.seed for run in runs]
-    wanted = "no seed of tuning" if of_track is None else ", ".join(map(str, of_track.seeds))
-    rules = seed_rules(seeds, method["tuning"]["seeds"], of_track)
-    yield _rules("seeds", rules, wanted, ", ".join(map(str, seeds)))
-    entry = method["entry_point"]
-    yield _rules("way to run it again", [entry_rule(submission.config, entry)], "agent or entry_point", str(entry))
-    rule = oracle_rule(submission.config)
-    yield _rules("oracle", [rule], "none", "none" if rule[0] else "one")
-    facts = facts_of(submission.curriculum.protocol, runs)
-    rules = fact_rules(method, facts, runs, len(submission.curriculum.tasks))
-    said = {part: method[part] for part in facts}
-    yield _rules("method", rules, str(facts), str(said))
-
-
-def _rules(what: str, rules: Sequence[Rule], expected: str, found: str) -> Check:
-    broken = "; ".join(message for holds, message in rules if not holds)
-    return Check(what, expected, found, not broken, note=broken)
+    facts = facts_of(curriculum.protocol, runs)
+    rules = {
+        "curriculum": [curriculum_rule(curriculum, of_track)],
+        "seeds": seed_rules([run.seed for run in runs], method["tuning"]["seeds"], of_track),
+        "way to run it again": [entry_rule(submission.config, method["entry_point"])],
+        "oracle": [oracle_rule(submission.config)],
+        "method": fact_rules(method, facts, runs, len(curriculum.tasks)),
+    }
+    for what, own in rules.items():
+        broken = "; ".join(message for holds, message in own if not holds)
+        yield Check(what, "all rules hold", broken or "they hold", not broken)
 
 
 def _of_the_log(submission: Submission, run: SubmittedRun, log: RunLog) -> Iterator[Check]:
