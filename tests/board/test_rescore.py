@@ -13,6 +13,7 @@ import pytest
 from helpers.paths import CHECKOUT
 from helpers.submissions import edit, edit_run
 
+import curricula
 from ctgraph_rl import RunLog
 from ctgraph_rl.board import rerun, verify
 from ctgraph_rl.board.rescore import RESCORED, Check, rescore, scores_of
@@ -95,6 +96,9 @@ def test_another_curriculum_is_found(submission):
         (lambda given: given["method"]["given"].update(boundaries="hidden"), "method"),
         (lambda given: given["method"].update(bytes_per_task=10**9), "method"),
         (lambda given: given["method"]["tuning"].update(seeds=[1]), "seeds"),
+        (lambda given: given.update(curriculum=curricula.load("su_b1_4tasks").to_json()), "curriculum"),
+        (lambda given: given["config"].update(agent=None), "way to run it again"),
+        (lambda given: given["config"].update(detector={"_target_": "baselines.detectors.oracle.Oracle"}), "oracle"),
     ],
 )
 def test_an_edited_value_is_found(submission, change, what):
