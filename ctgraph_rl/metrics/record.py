@@ -142,12 +142,9 @@ def defined(
             for name in tensors:
                 if isinstance(given.arguments.get(name), (list, tuple, np.ndarray)):
                     given.arguments[name] = float64(given.arguments[name])
-            return _measured(*given.args, **given.kwargs)
-
-        def _measured(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Metric:
             try:
-                why = missing if isinstance(missing, str) else missing(*args, **kwargs)
-                return _metric(meaning, terms(*args, **kwargs).flatten(), why, aggregate)
+                why = missing if isinstance(missing, str) else missing(*given.args, **given.kwargs)
+                return _metric(meaning, terms(*given.args, **given.kwargs).flatten(), why, aggregate)
             except Undefined as reason:
                 return undefined(metric, str(reason))
 

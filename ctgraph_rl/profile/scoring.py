@@ -16,16 +16,16 @@ import yaml
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.learn.evaluate import Evaluator
-from ctgraph_rl.log.files import CURRICULUM, LOG
+from ctgraph_rl.log.files import LOG
 from ctgraph_rl.log.named_curricula import curriculum_named
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.metrics import Undefined
 from ctgraph_rl.packages import check_packages, class_named
 from ctgraph_rl.profile.properties import Evidence, Measured, measure
+from ctgraph_rl.report.bounds_of_runs import curriculum_of
 from ctgraph_rl.report.intervals import Bounds, gaffke
 from ctgraph_rl.report.names import displayed
 from ctgraph_rl.runs.read import MODIFIED, Problem, Run, grouped, present, why_left_out
-from ctgraph_rl.tasks.curriculum import Curriculum
 
 LEVEL = 0.95
 
@@ -232,10 +232,9 @@ def _evidence(run: Run) -> Evidence:
     """
     if run.reason:
         raise Undefined(f"{run.path} has no results, {run.reason}: {_command(run)}")
-    stored = run.path / CURRICULUM
     published = curriculum_named(run.group[0])
-    learned = Curriculum.from_json(stored) if stored.exists() else published
-    if learned.fingerprint != run.curriculum[1]:
+    learned = curriculum_of(run)
+    if learned is None:
         raise Undefined(f"{run.path} learned another curriculum than the published {run.group[0]}")
     if learned.version != published.version:
         raise Undefined(

@@ -66,7 +66,9 @@ class Interrupt:
         self._restore()
         if callable(requeue):
             with _deaf():
-                if not _is_being_ended():
+                shown = _shown_job()
+                is_ended = "JobState=COMPLETING" in shown or "JobState=CANCELLED" in shown  # a requeue would undo it
+                if not is_ended:
                     try:
                         requeue(_requeuing(), None)
                     except (OSError, subprocess.SubprocessError) as error:
@@ -100,12 +102,6 @@ def _deaf() -> Iterator[None]:
         for number, handler in before.items():
             if handler is not None:  # it was not set by Python
                 signal.signal(number, handler)
-
-
-def _is_being_ended() -> bool:
-    """Return whether SLURM ends this job for good, as by ``scancel``, which a requeue would undo."""
-    shown = _shown_job()
-    return "JobState=COMPLETING" in shown or "JobState=CANCELLED" in shown
 
 
 def _is_in_queue() -> bool:

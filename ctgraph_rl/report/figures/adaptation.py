@@ -9,9 +9,9 @@ from torch import Tensor
 
 from ctgraph_rl.metrics.adaptation import Adaptation
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, left_out
-from ctgraph_rl.report.figures.learning_curves import named
+from ctgraph_rl.report.figures.learning_curves import choose_looks, named
 from ctgraph_rl.report.sections import Result, Section
-from ctgraph_rl.report.style import MOST_AGENTS, WIDTHS, agent_style, beside, figure_width, new_figure
+from ctgraph_rl.report.style import MOST_AGENTS, WIDTHS, beside, figure_width, new_figure
 from ctgraph_rl.runs.read import histories
 
 KINDS = ("trained", "held-out")
@@ -19,8 +19,8 @@ KINDS = ("trained", "held-out")
 
 def adaptation_curves(section: Section) -> CaptionedFigure | None:
     """Return all agents' curves of the last evaluation with adaptation, if any."""
-    shown = section.results[:MOST_AGENTS]
-    kinds = [kind for kind in KINDS if any(_of_seeds(result, kind) for result in shown)]
+    shown = choose_looks(section)
+    kinds = [kind for kind in KINDS if any(_of_seeds(result, kind) for result, _ in shown)]
     if not kinds:
         return None
     caption = (
@@ -31,15 +31,14 @@ def adaptation_curves(section: Section) -> CaptionedFigure | None:
     figure = new_figure(max(WIDTHS["column"], figure_width() * len(kinds) / len(KINDS)), 2.6)
     panels = figure.subplots(1, len(kinds), squeeze=False, sharey=True)[0]
     for axes, kind in zip(panels, kinds, strict=True):
-        for position, result in enumerate(shown):
-            look = agent_style(position, result.agent)
+        for result, look in shown:
             seeds = [adaptation.success.mean(dim=0) for adaptation in _of_seeds(result, kind)]
             for success in seeds:
                 axes.plot(_episodes(success), success, color=look["color"], linewidth=0.4, marker="", linestyle="-")
             if seeds:
                 mean = torch.stack(seeds).mean(dim=0)
                 axes.plot(_episodes(mean), mean, label=named(result), markevery=1 + len(mean) // 8, **look)
-        exact = next(chain(*(_of_seeds(result, kind) for result in shown))).exact.mean(dim=0)
+        exact = next(chain(*(_of_seeds(result, kind) for result, _ in shown))).exact.mean(dim=0)
         axes.plot(_episodes(exact), exact, "k--", marker="", linewidth=1, label="best search")
         axes.set(title=f"{kind} tasks", xlabel="episode of a row", ylim=(-0.05, 1.05))
     panels[0].set_ylabel("share at the goal")

@@ -60,7 +60,7 @@ def learning_curves(section: Section) -> CaptionedFigure | None:
     grid = panels(len(labels), COLUMNS, 1.45, width, sharex=True, sharey=True)
     for task, (axes, label) in enumerate(zip(grid.ravel(), labels, strict=False)):
         _mark_blocks(axes, section, task)
-        for result, look in _looks(section):
+        for result, look in choose_looks(section):
             seeds = [history.evaluations.get(label, []) for history in histories(result.finished)]
             points = evaluation_curve(result.finished, label, result.bounds.of_task(label))
             _draw(axes, look, [points], seeds if len(seeds) <= MOST_SEEDS else [])
@@ -78,7 +78,7 @@ def mean_curves(section: Section) -> CaptionedFigure | None:
         f"seeds, up to {MOST_SEEDS}. Dashed: ends of blocks."
     )
     grid = panels(1, 1, 2.3, room=0)
-    draw_means(grid[0, 0], section, {result.agent: look for result, look in _looks(section)})
+    draw_means(grid[0, 0], section, {result.agent: look for result, look in choose_looks(section)})
     figure = _finished(grid, section, "mean return over all tasks")
     return CaptionedFigure("mean", "Mean return over all tasks", caption, figure)
 
@@ -97,7 +97,7 @@ def training_curves(section: Section) -> CaptionedFigure | None:
     _mark_blocks(axes, section, None)
     blocks = list(enumerate(zip(section.ends, section.ends[1:], strict=False), 1))
     places = max(4, PLACES // max(len(blocks), 1))
-    for result, look in _looks(section):
+    for result, look in choose_looks(section):
         pieces = _training(result, blocks, places)
         seeds = []
         for run in result.finished if len(result.finished) < FEWEST_FOR_BANDS else ():
@@ -119,7 +119,7 @@ def unit_curves(section: Section) -> CaptionedFigure | None:
     grid = panels(len(UNIT_METRICS), len(UNIT_METRICS), 1.9, sharex=True, sharey=True)
     for axes, (name, title) in zip(grid.ravel(), UNIT_METRICS.items(), strict=True):
         _mark_blocks(axes, section, None)
-        for result, look in _looks(section):
+        for result, look in choose_looks(section):
             seeds = [history.units[name] for history in histories(result.finished) if name in history.units]
             _draw(axes, look, [over_seeds(seeds, Bounds(0, 1))], seeds if len(seeds) <= MOST_SEEDS else [])
         axes.set_title(title)
@@ -170,7 +170,8 @@ def experiments(found: Sequence[Section]) -> CaptionedFigure | None:
     return CaptionedFigure("experiments", "All experiments", caption, figure)
 
 
-def _looks(section: Section) -> list[tuple[Result, NamedValues]]:
+def choose_looks(section: Section) -> list[tuple[Result, NamedValues]]:
+    """Return the agents that figures show, each with the look of its curve."""
     shown = section.results[:MOST_AGENTS]
     return [(result, agent_style(position, result.agent)) for position, result in enumerate(shown)]
 
@@ -226,7 +227,7 @@ def _finished(grid: Any, section: Section, ylabel: str) -> Any:
         row[0].set_ylabel(ylabel)
     figure = grid[0, 0].figure
     figure.supxlabel("frames", fontsize=8)
-    agents_legend(figure, [(named(result), look) for result, look in _looks(section)])
+    agents_legend(figure, [(named(result), look) for result, look in choose_looks(section)])
     return figure
 
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from ctgraph_rl.report.bounds_of_runs import curriculum_of
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, left_out
-from ctgraph_rl.report.figures.learning_curves import named
+from ctgraph_rl.report.figures.learning_curves import choose_looks, named
 from ctgraph_rl.report.sections import Section
-from ctgraph_rl.report.style import MOST_AGENTS, agent_style, agents_legend, panels
+from ctgraph_rl.report.style import MOST_AGENTS, agents_legend, panels
 from ctgraph_rl.runs.read import histories
 from ctgraph_rl.tasks.curriculum import LAGS, Stream
 from ctgraph_rl.tasks.gain import reached_by_policies
@@ -32,7 +32,7 @@ def life_windows(section: Section) -> CaptionedFigure | None:
     """Return all agents' means over windows of a stream; None for other curricula, and without a finished run."""
     if not section.finished or "life" not in section.one.about:
         return None
-    shown = section.results[:MOST_AGENTS]
+    shown = choose_looks(section)
     frames = section.one.about["num_frames"] / section.one.about["life"]
     policies = _reached(curriculum_of(section.one))
     caption = (
@@ -44,25 +44,25 @@ def life_windows(section: Section) -> CaptionedFigure | None:
     grid = panels(len(PANELS) + 1, 2, 2.2)
     *of_windows, last = grid.ravel()[: len(PANELS) + 1]
     for axes, (metric, title) in zip(of_windows, PANELS.items(), strict=True):
-        for position, result in enumerate(shown):
+        for result, look in shown:
             ends = next((history.ends for history in histories(result.finished)), ())
             rows: list[Any] = [run.windows(metric) for run in result.finished]
             if metric == "frame_regret":
                 rows = [np.divide(row, np.diff(ends)) for row in rows]
-            _draw(axes, np.divide(ends[1:], frames), rows, agent_style(position, result.agent))
+            _draw(axes, np.divide(ends[1:], frames), rows, look)
         for name, values in policies.items():
             if metric in values:
                 axes.axhline(values[metric], zorder=0, **GREY, linestyle=LINES[name])
         axes.set(xlabel="tasks so far", ylabel=title)
     of_windows[1].set_ylim(-0.05, 1.05)
-    for position, result in enumerate(shown):
+    for result, look in shown:
         kept = [[run.metrics.get(f"retention_{lag}", {}).get("value") for lag in LAGS] for run in result.finished]
-        _draw(last, LAGS, np.array(kept, np.float64).tolist(), agent_style(position, result.agent))
+        _draw(last, LAGS, np.array(kept, np.float64).tolist(), look)
     last.set(xlabel="blocks later", xscale="log", ylabel="retention")
     last.set_xticks(LAGS, [str(lag) for lag in LAGS])
     last.minorticks_off()
     figure = grid[0, 0].figure
-    looks = [(named(result), agent_style(position, result.agent)) for position, result in enumerate(shown)]
+    looks = [(named(result), look) for result, look in shown]
     agents_legend(figure, [*looks, *((name, {**GREY, "linestyle": LINES[name]}) for name in policies)])
     return CaptionedFigure("life", "A life by windows", caption, figure)
 
