@@ -385,7 +385,7 @@ class RunLog:
         for task, training, own in self._stays(tasks):
             rows.append((names.setdefault(label[task], len(names)), training, len(own)))
             values += own
-        return RegimeTable(names, *zip(*rows, strict=True), values=_row(values))
+        return RegimeTable(names, _row(values), *zip(*rows, strict=True))
 
     def _stays(self, tasks: Sequence[int]) -> Iterator[tuple[int, bool, list[float | None]]]:
         at_end: dict[int, list[NamedValues]] = {}

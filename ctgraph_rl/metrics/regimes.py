@@ -45,16 +45,16 @@ class RegimeTable(Sequence[Regime]):
 
     Args:
         names: of tasks.
+        values: the experiences of all regimes in order, float64 [experiences].
         task: each regime's task, by its position in the names.
         training: False for an evaluation.
         length: number of each regime's experiences.
-        values: the experiences of all regimes in order, float64 [experiences].
 
     Raises:
         ValueError: for a regime that `Regime` refuses.
     """
 
-    def __init__(self, names: Iterable[str], task: Any, training: Any, length: Any, values: Tensor) -> None:
+    def __init__(self, names: Iterable[str], values: Tensor, task: Any, training: Any, length: Any) -> None:
         self.names = tuple(names)
         self.values = values
         self.task = np.asarray(task, dtype=np.int64)
@@ -79,11 +79,11 @@ class RegimeTable(Sequence[Regime]):
         training = [each.training for each in regimes]
         length = [len(each.values) for each in regimes]
         nothing = torch.empty(0, dtype=torch.float64, device="cpu")
-        return cls(names, task, training, length, torch.cat([nothing, *(each.values for each in regimes)]))
+        return cls(names, torch.cat([nothing, *(each.values for each in regimes)]), task, training, length)
 
     def replaced(self, values: Tensor) -> RegimeTable:
         """Return the table with other values."""
-        return RegimeTable(self.names, self.task, self.training, self.length, values)
+        return RegimeTable(self.names, values, self.task, self.training, self.length)
 
     def __len__(self) -> int:
         return len(self.task)
