@@ -399,8 +399,7 @@ class InnerLoop(Learner):
         count = chosen.sum(dim=1, keepdim=True)
         place = torch.arange(int(count.max()), device=rows.device)
         first = chosen.int().argmax(dim=1, keepdim=True)
-        steps = (first + place).clamp(max=chosen.shape[1] - 1)
-        at = (rows.unsqueeze(-1), steps)
+        at = (rows.unsqueeze(-1), (first + place).clamp(max=chosen.shape[1] - 1))
         number = torch.where(place < count, batch["next", "trial"].squeeze(-1)[at], 0)
         steps = {key: batch[key][at] for key in (*self.specs, "action")}
         return Played(steps, batch["next", "reward"].squeeze(-1)[at], number)
