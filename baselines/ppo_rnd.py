@@ -30,10 +30,10 @@ from torchrl.data import Composite, TensorSpec
 from typing_extensions import override
 
 from baselines.cells.cell import linear_layer
+from baselines.parts.learner import reset_layer
 from baselines.parts.networks import Data, Items, TensorsByName, critic, encoder, highest
 from baselines.parts.policy_gradient import Seeds, generalized_advantages
 from baselines.ppo import PPO, PPOSettings
-from baselines.update.trained import reset_layer
 from baselines.update.update import make_optimiser, minimise
 from ctgraph_rl.checks import NamedValues, at_least_one, fraction, not_negative, positive, require, require_memory
 

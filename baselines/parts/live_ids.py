@@ -8,21 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from baselines.parts.hooks import Hooks, PlasticityHooks
 from baselines.parts.networks import IdLinear, TensorsByName
-from baselines.update.trained import Trained
 from baselines.update.update import MOMENTS, has_parts
+
+if TYPE_CHECKING:
+    from baselines.parts.learner import Learner
 
 MANY_IDS = 1024
 """Fewest ids of a layer from which it learns without those that were never shown."""
 
 
 @contextmanager
-def only_live_ids(learner: Trained, shown: Tensor) -> Iterator[None]:
+def only_live_ids(learner: Learner, shown: Tensor) -> Iterator[None]:
     """Learn with the columns of ids that are shown or were; the layers have all columns before and after.
 
     On GPUs, compiled, with a method, a plasticity, weight decay or another optimiser they keep all columns, as these
@@ -55,13 +58,13 @@ def only_live_ids(learner: Trained, shown: Tensor) -> Iterator[None]:
             table.widen()
 
 
-def _leaves_others(learner: Trained, shown: Tensor) -> bool:
+def _leaves_others(learner: Learner, shown: Tensor) -> bool:
     is_plain = type(learner.method) is Hooks and type(learner.plasticity) is PlasticityHooks
     decays = any(group["weight_decay"] for group in learner.optimiser.param_groups)
     return shown.is_cpu and is_plain and learner.compiled_step is None and has_parts(learner.optimiser) and not decays
 
 
-def _layers(learner: Trained) -> list[IdLinear]:
+def _layers(learner: Learner) -> list[IdLinear]:
     found = []
     for module in learner.modules():
         if isinstance(module, IdLinear) and module.num_ids >= MANY_IDS:

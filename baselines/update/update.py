@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -17,10 +17,12 @@ from torch.optim.rmsprop import rmsprop
 
 from baselines.parts.hooks import Hooks
 from baselines.parts.networks import Data, TensorsByName
-from baselines.update.trained import Trained
 from ctgraph_rl.core.device import captures
 from ctgraph_rl.core.dynamics import beside
 from ctgraph_rl.core.region import Region
+
+if TYPE_CHECKING:
+    from baselines.parts.learner import Learner
 
 OPTIMISERS = ("adam", "rmsprop")
 
@@ -66,13 +68,10 @@ class UpdateState(NamedTuple):
     """Names of matrices kept as [seeds, inputs, outputs], as the backward pass returns their gradients."""
 
     others: Mapping[str, Tensor] = {}
-    """From `Trained.other_weights`, of several seeds [seeds, ...] each."""
+    """From `Learner.other_weights`, of several seeds [seeds, ...] each."""
 
 
-Update = Callable[[Trained, UpdateState, Data], TensorsByName]
-
-
-def update(learner: Trained, state: UpdateState, batch: Data) -> TensorsByName:
+def update(learner: Learner, state: UpdateState, batch: Data) -> TensorsByName:
     """Minimise the sum of the losses of a batch by one step; return losses and gradient norm.
 
     It has no branch on data and depends only on its arguments. With several seeds minibatches are [seeds, items, ...]
@@ -90,14 +89,14 @@ def update(learner: Trained, state: UpdateState, batch: Data) -> TensorsByName:
     return {**{key: value.detach() for key, value in losses.items()}, "grad_norm": norm}
 
 
-def losses_of(learner: Trained, state: UpdateState, batch: Data) -> TensorsByName:
+def losses_of(learner: Learner, state: UpdateState, batch: Data) -> TensorsByName:
     """Return the agent's losses and the method's penalties, of each seed if there are several."""
     if state.tensors is None:
         return learner.losses(state.weights, batch, state.others)
     return over_seeds(learner, type(learner).losses, state, batch, state.others)
 
 
-def over_seeds(learner: Trained, function: Callable[..., Any], state: UpdateState, *given: Any) -> Any:
+def over_seeds(learner: Learner, function: Callable[..., Any], state: UpdateState, *given: Any) -> Any:
     """Return a function of a learner, its weights and further tensors for each seed."""
 
     def of_one(tensors: TensorsByName, *its: Any) -> Any:
@@ -106,7 +105,7 @@ def over_seeds(learner: Trained, function: Callable[..., Any], state: UpdateStat
     return vmap(of_one)(_seen(state), *given)
 
 
-def with_tensors(learner: Trained, state: UpdateState, function: Callable[..., Any], *given: Any) -> Any:
+def with_tensors(learner: Learner, state: UpdateState, function: Callable[..., Any], *given: Any) -> Any:
     """Return a function of a learner with a state's tensors, those of all seeds at once, and its weights."""
     if state.tensors is None:
         return function(learner, state.weights, *given)
@@ -114,7 +113,7 @@ def with_tensors(learner: Trained, state: UpdateState, function: Callable[..., A
 
 
 def _with(
-    learner: Trained, tensors: TensorsByName, function: Callable[..., Any], state: UpdateState, *given: Any
+    learner: Learner, tensors: TensorsByName, function: Callable[..., Any], state: UpdateState, *given: Any
 ) -> Any:
     weights = [tensors[name] for name in state.names]
     return functional_call(learner, tensors, (function, weights, *given), tie_weights=False)
@@ -125,7 +124,7 @@ def _seen(state: UpdateState) -> TensorsByName:
     return {name: value.mT if name in state.turned else value for name, value in tensors.items()}
 
 
-def _descend(learner: Trained, weights: Sequence[Tensor], state: UpdateState, gradients: Sequence[Tensor]) -> Tensor:
+def _descend(learner: Learner, weights: Sequence[Tensor], state: UpdateState, gradients: Sequence[Tensor]) -> Tensor:
     is_stacked = state.tensors is not None
     if is_stacked:
         gradients = [unstacked(gradient) for gradient in gradients]
@@ -144,7 +143,7 @@ def _descend(learner: Trained, weights: Sequence[Tensor], state: UpdateState, gr
 
 
 def transform_gradients(
-    learner: Trained, weights: Sequence[Tensor], state: UpdateState, gradients: Sequence[Tensor]
+    learner: Learner, weights: Sequence[Tensor], state: UpdateState, gradients: Sequence[Tensor]
 ) -> Sequence[Tensor]:
     """Return the gradients of what is trained, given those of the weights."""
     if state.tensors is not None and learner.method.of_one_seed:
@@ -152,11 +151,11 @@ def transform_gradients(
     return _transform_gradients(learner, weights, gradients)
 
 
-def _transform_gradients(learner: Trained, weights: Sequence[Tensor], gradients: Sequence[Tensor]) -> Sequence[Tensor]:
+def _transform_gradients(learner: Learner, weights: Sequence[Tensor], gradients: Sequence[Tensor]) -> Sequence[Tensor]:
     return learner.method.transform_gradients(gradients, weights)
 
 
-def _after_step(learner: Trained, weights: Sequence[Tensor]) -> tuple[()]:
+def _after_step(learner: Learner, weights: Sequence[Tensor]) -> tuple[()]:
     learner.method.after_step(weights)
     return ()  # seeds are vectorised over what returns tensors, or none of them
 
@@ -272,7 +271,7 @@ def step(optimiser: Parts | torch.optim.Optimizer, gradients: Sequence[Tensor]) 
         )
 
 
-def take_step(learner: Trained, batch: Data) -> TensorsByName:
+def take_step(learner: Learner, batch: Data) -> TensorsByName:
     """Take a step; the first one and unusual sizes run `update` as written."""
     is_first = not learner.optimiser.state
     state = update_state(learner)
@@ -286,17 +285,17 @@ def take_step(learner: Trained, batch: Data) -> TensorsByName:
     return learner.region.copies(batch)
 
 
-def usual_update(learner: Trained, state: UpdateState, batch: Data) -> TensorsByName:
+def usual_update(learner: Learner, state: UpdateState, batch: Data) -> TensorsByName:
     """Take the step, compiled where the agent is."""
     return (learner.compiled_step or update)(learner, state, batch)
 
 
-def update_state(learner: Trained) -> UpdateState:
+def update_state(learner: Learner) -> UpdateState:
     """Return what an update of a learner changes."""
     return UpdateState(learner.weights, parts_of(learner.optimiser), others=learner.other_weights())
 
 
-def is_captured(learner: Trained) -> bool:
+def is_captured(learner: Learner) -> bool:
     """Return whether steps are CUDA graphs: on GPUs, without a method."""
     on_gpu = captures(learner.trainable[0].device)
     return on_gpu and learner.capturable and type(learner.method) is Hooks and has_parts(learner.optimiser)

@@ -128,7 +128,6 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "baselines.parts.inner_loop:InnerModel,Played",
             "baselines.parts.gates:GatedNetwork",
             "baselines.update.update:UpdateState,update,Parts,make_optimiser,has_parts,parts_of,minimise,step",
-            "baselines.update.trained:Trained",
             "baselines.parts.embedding",
             "baselines.cells.cell:Units",
             "baselines.parts.transport",

@@ -79,7 +79,9 @@ def test_a_stack_of_agents_with_convolutions_computes_what_each_computes(small_a
     [batch] = batches(agents[0], IMAGES, 1)
     seen = {"observation": batch["observation"][:, 1]}
 
-    together = Stack(agents).outputs({key: torch.stack([value] * 2) for key, value in seen.items()})
+    stack = Stack(agents)
+    data = {key: torch.stack([value] * 2) for key, value in seen.items()}
+    together = stack.traced_outputs(data)(*stack.acting_inputs(data))
 
     for number, agent in enumerate(agents):
         for key, value in agent.outputs(seen).items():
