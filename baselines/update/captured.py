@@ -233,10 +233,9 @@ class CapturedGroup(SeedGroup):
     @property
     def seeds(self) -> Seeds:
         """What the minibatches of all agents are made with."""
-        return Seeds(len(self.learners), self._values, self.draws.orders)
-
-    def _values(self, data: Items) -> Tensor:
-        return self.one_step(data)["state_value"].flatten(0, 1)
+        return Seeds(
+            len(self.learners), lambda data: self.one_step(data)["state_value"].flatten(0, 1), self.draws.orders
+        )
 
     def _transformed(self, minibatch: TensorsByName) -> TensorsByName:
         if not self.methods:

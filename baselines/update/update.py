@@ -201,21 +201,19 @@ def parts_of(optimiser: torch.optim.Optimizer) -> Parts | torch.optim.Optimizer:
         return optimiser
     [group] = optimiser.param_groups
     parameters: list[Tensor] = list(group["params"])
-    state = [_prepare_state(optimiser, parameter, bool(group.get("fused"))) for parameter in parameters]
+    states = []
+    for parameter in parameters:
+        state = optimiser.state[parameter]
+        if not state:
+            device = parameter.device if group.get("fused") or parameter.is_cuda else "cpu"
+            state["step"] = torch.zeros((), dtype=torch.float32, device=device)
+            for name in MOMENTS[type(optimiser)]:
+                state[name] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
+        elif parameter.is_cuda:
+            state["step"] = state["step"].to(parameter.device)
+        states.append(state)
     settings = {key: value for key, value in group.items() if key != "params"}
-    return Parts(type(optimiser) is torch.optim.Adam, settings, parameters, state)
-
-
-def _prepare_state(optimiser: torch.optim.Optimizer, parameter: Tensor, fused: bool) -> TensorsByName:
-    state = optimiser.state[parameter]
-    if not state:
-        device = parameter.device if fused or parameter.is_cuda else "cpu"
-        state["step"] = torch.zeros((), dtype=torch.float32, device=device)
-        for name in MOMENTS[type(optimiser)]:
-            state[name] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
-    elif parameter.is_cuda:
-        state["step"] = state["step"].to(parameter.device)
-    return state
+    return Parts(type(optimiser) is torch.optim.Adam, settings, parameters, states)
 
 
 def minimise(optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
