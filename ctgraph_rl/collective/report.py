@@ -13,6 +13,7 @@ from ctgraph_rl import parsers
 from ctgraph_rl.checks import require
 from ctgraph_rl.collective.summary import COLLECTIVE, RUN, WHAT, Collective, read_collective, tables
 from ctgraph_rl.disk import make_folder, write_whole
+from ctgraph_rl.learn.messages import DELAYED, DROPPED, SENT
 from ctgraph_rl.log.escape import csv_text, markdown_table, markdown_text, refused_by, terminal_text
 from ctgraph_rl.log.files import METRICS, locked
 from ctgraph_rl.metrics.record import MASTERED
@@ -25,10 +26,7 @@ MEASURES = ("learning_time", "share_learned", "final_return")
 
 COLUMNS = (*RUN, "every", "drop_prob", "delay_prob", *MEASURES, *WHAT, "bytes", "helps")
 
-SHOWN = (
-    *("curriculum", "agent", "method", "exchange", "num_members", "seed"),
-    *("learning_time", "share_learned", "final_return", "sent", "dropped", "delayed", "bytes", "helps"),
-)
+SHOWN = (*RUN, *MEASURES, SENT, DROPPED, DELAYED, "bytes", "helps")
 
 MEANING = (
     f"learning_time: mean over members and blocks of the frames until {MASTERED} of a batch are at the goal; a block "

@@ -6,40 +6,25 @@ import json
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.report.style import require_packages
-from ctgraph_rl.runs.read import FOLDER, NO_METHOD, Run, called, find_runs, grouped, present
+from ctgraph_rl.runs.read import FOLDER, NO_METHOD, Run, Value, called, find_runs, grouped, present
 
 if TYPE_CHECKING:
     import pandas
 
 
-class FrameRow(NamedTuple):
-    """A row of `results`: a run, and one of its numbers."""
-
-    run: str
-    agent: str
-    method: str
-    settings: str
-    learner: str
-    curriculum: str
-    fingerprint: str
-    numbers_version: int
-    seed: int
-    task: str | None
-    held_out: bool | None
-    block: int | None
-    moment: str | None
-    frames: int | None
-    episode: int | None
-    metric: str
-    value: float | None
-
+COLUMNS = (
+    *("run", "agent", "method", "settings", "learner"),
+    *("curriculum", "fingerprint", "numbers_version", "seed"),
+    *Value._fields,
+)
+"""A run, and one of its numbers."""
 
 DTYPES = {
-    **dict.fromkeys(FrameRow._fields, "category"),
+    **dict.fromkeys(COLUMNS, "category"),
     **dict.fromkeys(("numbers_version", "seed"), "int64"),
     **dict.fromkeys(("block", "frames", "episode"), "Int64"),
     "held_out": "boolean",
@@ -95,11 +80,11 @@ def results(paths: Path | str | Sequence[Path | str], tuning: bool = False) -> p
     require((bool(finished), f"no run is finished: {'; '.join(left_out)}"))
     for reason in left_out:
         warnings.warn(f"left out: {reason}", stacklevel=2)
-    return pandas.DataFrame(rows(finished), columns=FrameRow._fields).astype(DTYPES)
+    return pandas.DataFrame(rows(finished), columns=COLUMNS).astype(DTYPES)
 
 
-def rows(runs: Sequence[Run]) -> Iterator[FrameRow]:
-    """Yield the rows of runs, in the order of tables."""
+def rows(runs: Sequence[Run]) -> Iterator[tuple[Any, ...]]:
+    """Yield the rows of runs, of `COLUMNS`, in the order of tables."""
     for (_, learner), by_seed in grouped(runs).items():
         for run in present(by_seed):
             config = run.about["config"]
@@ -108,4 +93,4 @@ def rows(runs: Sequence[Run]) -> Iterator[FrameRow]:
             names = (str(run.path), agent, called(config.get("method")) or NO_METHOD, settings, learner)
             number = (run.code["numbers version"], run.seed)
             for value in run.values:
-                yield FrameRow._make((*names, *run.curriculum, *number, *value))
+                yield (*names, *run.curriculum, *number, *value)

@@ -29,14 +29,14 @@ from ctgraph_rl.runs.train import MakeAgent, new_agent, with_method
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.task_like import TaskLike
 
-OURS = {
-    "agent": re.compile(r"(baselines\.\w+)\.(\w+)"),
-    "method": re.compile(r"(baselines\.methods\.\w+)\.(\w+)"),
-    "plasticity": re.compile(r"(baselines\.plasticity\.\w+)\.(\w+)"),
-    "cell": re.compile(r"(baselines\.cells\.\w+)\.(\w+)"),
-    "detector": re.compile(r"(baselines\.detectors\.\w+)\.(\w+)"),
+PACKAGES = {
+    "agent": "baselines",
+    "method": "baselines.methods",
+    "plasticity": "baselines.plasticity",
+    "cell": "baselines.cells",
+    "detector": "baselines.detectors",
 }
-"""Agents and their parts that a directory may name."""
+"""Of agents and their parts that a directory may name."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ def _builder(
     make_method: Callable[[], MethodLike] | None,
     curriculum: Curriculum,
 ) -> MakeAgent:
-    stored = {part: config.get(part) for part in OURS}
+    stored = {part: config.get(part) for part in PACKAGES}
     named = make_agent is None
     alone = _ours(run_dir, "agent", stored["agent"]) if named else _with(run_dir, make_agent, stored["agent"])
     if make_method is not None:
@@ -156,7 +156,7 @@ def _with(run_dir: Path, make: Any, stored: Any) -> Callable[..., Any]:
 def _ours(run_dir: Path, part: str, settings: Any) -> Callable[..., Any]:
     settings = settings if isinstance(settings, Mapping) else {}
     name = str(settings.get("_target_"))
-    ours = OURS[part].fullmatch(name)
+    ours = re.fullmatch(rf"({re.escape(PACKAGES[part])}\.\w+)\.(\w+)", name)
     maker = "make_method" if part in ("method", "detector") else "make_agent"
     if ours is None:
         name = terminal_text(name[:80])
