@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import gzip
 import json
-import os
 import shutil
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from helpers.submissions import edit_run
+from helpers.submissions import edit_run, make_nested
 
 from ctgraph_rl.board.rescore import rescore
 from ctgraph_rl.board.standings.entries import read_entries
@@ -22,17 +21,6 @@ from ctgraph_rl.runs.read import find_runs
 def sparse(folder: Path) -> None:
     with (folder / "submission.json").open("wb") as file:
         file.truncate(10 * 2**30)
-
-
-def nested(folder: Path) -> None:
-    """Make folders within each other, more than Python's own functions can walk."""
-    where = os.open(folder, os.O_RDONLY)
-    for _ in range(1100):
-        os.mkdir("x", dir_fd=where)
-        inner = os.open("x", os.O_RDONLY, dir_fd=where)
-        os.close(where)
-        where = inner
-    os.close(where)
 
 
 def logged(folder: Path, kind: str = "experts", **fields: object) -> None:
@@ -137,7 +125,7 @@ def test_a_broken_run_is_one_line_and_no_end_for_others(tiny_home, tmp_path, fil
 
 def test_folders_within_too_many_others_are_no_end_for_runs_beside_them(tiny_home, tmp_path):
     shutil.copytree(tiny_home / "runs", tmp_path / "runs")
-    nested(tmp_path / "runs" / "tiny-seed0")
+    make_nested(tmp_path / "runs" / "tiny-seed0")
     try:
         runs, problems = find_runs([tmp_path / "runs"])
     finally:

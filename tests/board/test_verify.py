@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import shutil
 import signal
 import sys
@@ -13,7 +14,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from helpers.submissions import edit_run
+from helpers.submissions import edit_run, make_nested
 from helpers.sweeping import command_line
 
 from ctgraph_rl.board import isolate, relearn, rerun, verify
@@ -266,6 +267,25 @@ def test_a_link_in_place_of_a_result_is_a_failure(tiny_home, tiny_submission, tm
     run_dir_of(cell.folder, 0).symlink_to(tiny_home / "runs" / "tiny-seed0")
 
     assert "symbolic link" in result_of(cell, 0, Outcome(0, None, "")).failure
+
+
+@pytest.mark.parametrize("what", ["folders", "link"])
+def test_what_an_entry_point_left_is_removed_before_it_begins_again(tiny_submission, tmp_path, monkeypatch, what):
+    method = {**tiny_submission.method, "entry_point": "waiting_learner:train"}
+    (cell,) = cells_of(replace(tiny_submission, method=method), tiny_submission.runs[:1], tmp_path / "reruns")
+    (run_dir,) = cell.run_dirs
+    cell.folder.mkdir(parents=True)
+    (tmp_path / "kept").mkdir()
+    if what == "folders":
+        run_dir.mkdir()
+        make_nested(run_dir)
+    else:
+        run_dir.symlink_to(tmp_path / "kept")
+    monkeypatch.setattr(rerun, "run_isolated", lambda *given, **named: Outcome(0, None, ""))
+
+    rerun.learn_again(cell, Limits(1, 1, 1), None)
+
+    assert not os.path.lexists(run_dir) and (tmp_path / "kept").is_dir()
 
 
 @pytest.mark.slow

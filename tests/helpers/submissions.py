@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,3 +20,14 @@ def edit(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
 def edit_run(folder: Path, number: int = 0, **values: Any) -> None:
     """Change values of a run."""
     edit(folder, lambda content: content["runs"][number].update(values))
+
+
+def make_nested(folder: Path) -> None:
+    """Make folders within each other, more than Python's own functions can walk."""
+    where = os.open(folder, os.O_RDONLY)
+    for _ in range(1100):
+        os.mkdir("x", dir_fd=where)
+        inner = os.open("x", os.O_RDONLY, dir_fd=where)
+        os.close(where)
+        where = inner
+    os.close(where)
