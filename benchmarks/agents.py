@@ -230,11 +230,15 @@ def rungs(device: torch.device, num_rows: Sequence[int], num_seeds: Sequence[int
             if name == "ppo":
                 ways["compiled and captured"] = partial(learner, {**given, "compile": True})
             for way, make in ways.items():
-                yield Rung(f"{name}, {way}", label, n, lambda make=make: make().learn, GOALS[name])
+                yield Rung(f"{name}, {way}", label, n, partial(_begin, make), GOALS[name])
         for count in num_seeds:
             goal = SEEDS_GOAL if name == "lstm_ppo" else 0.0
             together = partial(seeds, values, task, count, device)
             yield Rung(f"{name}, {count:,} seeds as one job", label, count * values["num_envs"], together, goal)
+
+
+def _begin(make: Callable[[], Any]) -> TimedRun:
+    return make().learn
 
 
 def seeds(values: NamedValues, task: Task, num_seeds: int, device: torch.device) -> TimedRun:
@@ -295,7 +299,7 @@ def main(arguments: list[str] | None = None) -> None:
     speeds = []
     for one in measured:
         learner = cache(partial(one.make, 0))  # one learns in all rounds
-        speeds.append(Rung(one.who, one.agent, ROWS, lambda learner=learner: learner().learn))
+        speeds.append(Rung(one.who, one.agent, ROWS, partial(_begin, learner)))
     ladder.climb(speeds, options, CPU, "ours", in_turn=True)
     if options.seeds:
         print(f"\n{times_to_solve(measured, options)}")

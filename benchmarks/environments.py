@@ -201,9 +201,12 @@ def contenders(num_rows: list[int], names: list[str], with_kernel: bool) -> list
     """Everything measured on the CPU, in the table's order."""
     found: list[Rung] = []
 
+    def made(run: TimedRun) -> Callable[[], TimedRun]:
+        return lambda: run
+
     def add(configuration: str, n: int, ways: NamedRuns) -> None:
         for name, run in ways:
-            found.append(Rung(name, configuration, n, lambda run=run: run))
+            found.append(Rung(name, configuration, n, made(run)))
 
     tasks = configurations()
     ways = tuple(SUFFIX)[: 1 + with_kernel]

@@ -23,7 +23,7 @@ from ctgraph_rl.board.relearn import Relearning, run_dir_of
 from ctgraph_rl.board.rescore import Check, equal
 from ctgraph_rl.board.submission import Submission, SubmittedRun, counted_lines, log_sum
 from ctgraph_rl.board.two_samples import compare_samples
-from ctgraph_rl.checks import ReadOnlyValues, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, require
 from ctgraph_rl.disk import make_folder, read_text, require_no_link, write_whole
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CURRICULUM, FAILURE, LOG, METRICS, MOST_BYTES_OF_A_REASON
@@ -215,7 +215,7 @@ def checks_of(run: SubmittedRun, submitted: RunLog, result: Rerun, other_bits: S
 
 def first_difference(submitted: RunLog, found: RunLog) -> str:
     """Return in words the first measurement in which two logs differ, if any."""
-    lines = zip_longest(counted_lines(submitted), counted_lines(found), fillvalue={})
+    lines = zip_longest(counted_lines(submitted), counted_lines(found), fillvalue=NamedValues())
     for number, (one, other) in enumerate(lines, 1):
         keys = [key for key in {**one, **other} if one.get(key) != other.get(key)]
         if keys:
