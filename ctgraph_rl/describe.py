@@ -117,7 +117,7 @@ def describe(curriculum: Curriculum, frames_per_second: float | None = None) -> 
     require(*(positive(frames_per_second=frames_per_second) if frames_per_second is not None else ()))
     overview = _overview(curriculum, frames_per_second)
     if not are_graphs(curriculum.examples):
-        return [overview, _other_blocks(curriculum)]
+        return [overview, _blocks(curriculum)]
     return [overview, _blocks(curriculum), _difficulty(curriculum), _ceilings(curriculum), _observations(curriculum)]
 
 
@@ -214,36 +214,35 @@ def evaluation_in_words(evaluation: Evaluation, is_life: bool = False) -> str:
 
 
 def _blocks(curriculum: Curriculum) -> Sheet:
-    columns = {"block": "r", "task": "l", "b": "r", "d": "r", "p": "r", "goal": "l", "frames": "r"}
     switches = any(block.switch is not None for block in curriculum.example_blocks)
     shown = curriculum.blocks[:MOST_SHOWN] if isinstance(curriculum, Stream) else curriculum.blocks
     numbers = dict.fromkeys(chain.from_iterable(curriculum.trained[: len(shown)]))
     labels = {curriculum.tasks[number]: curriculum.labels[number] for number in numbers}
+    columns = {"block": "r", "task": "l"}
+    notes = []
+    if are_graphs(curriculum.examples):
+        columns |= {"b": "r", "d": "r", "p": "r", "goal": "l"}
+    else:
+        kind = type(curriculum.tasks[0]).__name__
+        notes.append(f"Tasks are of {kind}: difficulty and ceilings are known only of CT-graphs.")
+    columns["frames"] = "r"
     if switches:
         columns["switch"] = "l"
+    if len(shown) < len(curriculum.blocks):
+        notes.append(f"The first {len(shown)} of {len(curriculum.blocks):,} blocks.")
     rows = []
     for number, block in enumerate(shown, 1):
         name = str(number)
         frames = f"{block.num_frames:,}"
         switch = "" if block.switch is None else repr(block.switch)
-        for task in dict.fromkeys(ct_graphs(block.tasks, "this sheet")):
-            graph = task.graph
-            shape = (str(graph.branching_factor), str(graph.depth), f"{graph.wait_prob:g}")
-            row = (name, labels[task], *shape, write_goal(task.goal), frames, switch)
-            rows.append(row[: len(columns)])
-            name = frames = switch = ""
-    more = [f"The first {len(shown)} of {len(curriculum.blocks):,} blocks."] * (len(shown) < len(curriculum.blocks))
-    return Sheet("Blocks", columns, tuple(rows), tuple(more))
-
-
-def _other_blocks(curriculum: Curriculum) -> Sheet:
-    labels = dict(zip(curriculum.tasks, curriculum.labels, strict=True))
-    rows = []
-    for number, block in enumerate(curriculum.blocks, 1):
         for task in dict.fromkeys(block.tasks):
-            rows.append((str(number), labels[task], f"{block.num_frames:,}"))
-    note = f"Tasks are of {type(curriculum.tasks[0]).__name__}: difficulty and ceilings are known only of CT-graphs."
-    return Sheet("Blocks", {"block": "r", "task": "l", "frames": "r"}, tuple(rows), (note,))
+            cells = [name, labels[task]]
+            if isinstance(task, Task):
+                graph = task.graph
+                cells += [str(graph.branching_factor), str(graph.depth), f"{graph.wait_prob:g}", write_goal(task.goal)]
+            rows.append((*cells, frames, switch)[: len(columns)])
+            name = frames = switch = ""
+    return Sheet("Blocks", columns, tuple(rows), tuple(notes))
 
 
 def _difficulty(curriculum: Curriculum) -> Sheet:
