@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import torch
@@ -11,10 +10,8 @@ from torch import Tensor
 
 from ctgraph_rl.checks import are_ints, is_int, plain, require
 from ctgraph_rl.core import philox
-from ctgraph_rl.core.goal import Goal
 from ctgraph_rl.tasks.protocol import MOST_IDS
 from ctgraph_rl.tasks.switch import Switch
-from ctgraph_rl.tasks.task import Task
 
 
 def require_num_ids(task_ids: Mapping[Any, int] | None, num_task_ids: int | None) -> int:
@@ -35,24 +32,6 @@ def require_num_ids(task_ids: Mapping[Any, int] | None, num_task_ids: int | None
 def one_hot_ids(ids: Tensor, length: int) -> Tensor:
     """Return ids, int64 [N], as one-hot uint8 [N, length]; zeros for -1."""
     return (ids.unsqueeze(-1) == torch.arange(length, device=ids.device)).to(torch.uint8)
-
-
-def find_leaves(tasks: Sequence[Task], goals: Iterable[Goal]) -> list[int]:
-    """Return the numbers of the end states that goals lead to.
-
-    Raises:
-        ValueError: if there is not one goal per row, or a goal is no end state of its row's tree.
-    """
-    goals = list(goals)
-    n = len(tasks)
-    require((len(goals) == n, f"set_goals needs one goal per row, {n} in all, got {len(goals)}"))
-    numbers = [goal for goal in goals if is_int(goal)]  # decisions or end states?
-    fix = 'write decisions as "1" or "1.2", and numbers of end states as an int64 tensor'
-    require((not numbers, f"goals must be decisions, got {numbers[:3]}: {fix}"))
-    leaves = []
-    for task, goal in zip(tasks, goals, strict=True):
-        leaves.append(replace(task, goal=goal).goal_leaf)  # type: ignore[arg-type]
-    return leaves
 
 
 EpisodePlace = tuple[Tensor, Tensor, Tensor]

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
 
-from ctgraph_rl.batch.assignment import Assignment, find_leaves
+from ctgraph_rl.batch.assignment import Assignment
 from ctgraph_rl.batch.native import Native, kernel_rule, knows, require_kernel
 from ctgraph_rl.batch.params import make_shared_bank, make_tables
 from ctgraph_rl.batch.tensor_engine import TensorEngine
@@ -274,7 +275,14 @@ class Rows(TakesNumbers, nn.Module):
             ValueError: if a goal is not one of its row's tree.
         """
         if not isinstance(goals, Tensor) or goals.ndim == 2:
-            goals = torch.tensor(find_leaves(self.tasks, plain(goals)), device=self.device, dtype=torch.int64)
+            listed = list(plain(goals))
+            n = self.num_rows
+            require((len(listed) == n, f"set_goals needs one goal per row, {n} in all, got {len(listed)}"))
+            numbers = [goal for goal in listed if is_int(goal)]  # decisions or end states?
+            fix = 'write decisions as "1" or "1.2", and numbers of end states as an int64 tensor'
+            require((not numbers, f"goals must be decisions, got {numbers[:3]}: {fix}"))
+            leaves = [replace(task, goal=goal).goal_leaf for task, goal in zip(self.tasks, listed, strict=True)]
+            goals = torch.tensor(leaves, device=self.device, dtype=torch.int64)
         fits = goals.shape == (self.num_rows,) and goals.dtype == torch.int64
         require((fits, f"goals must be int64 of shape [{self.num_rows}], got {goals.dtype} {list(goals.shape)}"))
         outside = (goals < 0) | (goals >= self.params.g.num_leaves)

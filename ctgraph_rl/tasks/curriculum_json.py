@@ -133,7 +133,6 @@ def read_curriculum(
         require((not is_int(schema, SCHEMA + 1), newer))
         require_keys(content, _KEYS)
         require((schema == SCHEMA, f"schema must be {SCHEMA}, got {schema!r}"))
-        require((isinstance(content["source"], str), f"source must be a text, got {content['source']!r:.80}"))
         listed = content["tasks"]
         require(count_rule(len(listed) if isinstance(listed, list) else 0))
         tasks = _each("tasks", listed, _task)
