@@ -22,7 +22,7 @@ from ctgraph_rl.log.scores import scores
 from ctgraph_rl.packages import class_named
 from ctgraph_rl.parsers import LEVELS
 from ctgraph_rl.report.columns import board_columns
-from ctgraph_rl.runs.load import OURS
+from ctgraph_rl.runs.load import match_class
 from ctgraph_rl.runs.read import MODIFIED
 from ctgraph_rl.runs.settings import differences, with_added
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -209,7 +209,7 @@ def oracle_rule(config: ReadOnlyValues) -> Rule:
     for group in ("method", "detector"):
         settings = config.get(group)
         name = str(settings.get("_target_")) if isinstance(settings, Mapping) else ""
-        ours = OURS[group].fullmatch(name)
+        ours = match_class(group, name)
         kind = None if ours is None else class_named(ours[1], ours[2])
         if kind is not None:
             kinds[group] = kind

@@ -153,10 +153,15 @@ def _with(run_dir: Path, make: Any, stored: Any) -> Callable[..., Any]:
     )
 
 
+def match_class(part: str, name: str) -> re.Match[str] | None:
+    """Match the module and the class of an agent or a part of it that this package defines."""
+    return re.fullmatch(rf"({re.escape(PACKAGES[part])}\.\w+)\.(\w+)", name)
+
+
 def _ours(run_dir: Path, part: str, settings: Any) -> Callable[..., Any]:
     settings = settings if isinstance(settings, Mapping) else {}
     name = str(settings.get("_target_"))
-    ours = re.fullmatch(rf"({re.escape(PACKAGES[part])}\.\w+)\.(\w+)", name)
+    ours = match_class(part, name)
     maker = "make_method" if part in ("method", "detector") else "make_agent"
     if ours is None:
         name = terminal_text(name[:80])
