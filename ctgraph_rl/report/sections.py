@@ -156,11 +156,6 @@ def sections(runs: Sequence[Run], count: Count = silent) -> list[Section]:
     return [Section(name, tuple(results), rows[name], modified.get(name, "")) for name, results in agents.items()]
 
 
-def evaluation_curve(runs: Iterable[Run], label: str, bounds: Bounds = UNBOUNDED) -> list[Point]:
-    """Mean return on a task at all evaluations at which every run has a value."""
-    return over_seeds([history.evaluations.get(label, []) for history in histories(runs)], bounds)
-
-
 def mean_curve(history: History) -> Curve:
     """Return a run's mean return over all tasks, at evaluations of all."""
     curves = [dict(history.evaluations.get(label, [])) for label in history.labels]

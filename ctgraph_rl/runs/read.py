@@ -435,8 +435,11 @@ def grouped(runs: Sequence[Run]) -> dict[AgentKey, dict[int, Run | None]]:
     groups: dict[tuple[Any, ...], dict[int, Run]] = {}
     expected: dict[Any, set[int]] = {}
     named: dict[CurriculumKey, str] = {}
-    for some in split_by(runs, _kind).values():
-        keys = _differing(some)
+    differing: dict[Any, list[str]] = {}
+    for kind, some in split_by(runs, _kind).items():
+        known = {key for run in some for key in run.settings}
+        keys = sorted(key for key in known if len({json.dumps(run.settings.get(key)) for run in some}) > 1)
+        differing[kind] = keys
         for run in sorted(some, key=lambda run: [_rank(run.settings.get(key)) for key in keys]):
             groups.setdefault(run.configuration, {})[run.seed] = run
             if run.agent is not None:
@@ -446,12 +449,20 @@ def grouped(runs: Sequence[Run]) -> dict[AgentKey, dict[int, Run | None]]:
     several = repeated(named.values())
     one_each = [next(iter(by_seed.values())) for by_seed in groups.values()]
     found: dict[AgentKey, dict[int, Run | None]] = {}
-    for one, agent, by_seed in zip(one_each, _agent_names(one_each), groups.values(), strict=True):
+    twins = split_by(one_each, lambda run: run.alike)
+    for one, by_seed in zip(one_each, groups.values(), strict=True):
         curriculum = named[one.group]
         if curriculum in several:
             curriculum += f" {one.group[1]}"
         seeds = sorted(by_seed if one.agent is None else expected[one.group, tuning_share(one.about)])
-        name = agent if one.shown is None else one.shown[1]
+        parts = [_name(one)]
+        for key in differing[_kind(one)]:
+            short = key.removeprefix("agent.").removeprefix("method.").removeprefix("plasticity.")
+            parts.append(f"{short}={one.settings.get(key)}")
+        code = code_of(one, twins[one.alike])
+        if code:
+            parts.append(f"({code})")
+        name = " ".join(parts) if one.shown is None else one.shown[1]
         found[curriculum, name] = {seed: by_seed.get(seed) for seed in seeds}
     return dict(sorted(found.items(), key=lambda item: min(map(_place, item[1].values()))))
 
@@ -477,21 +488,6 @@ def _rank(value: Any) -> tuple[int, float, str]:
     return (1, value, "") if is_real(value) else (0 if value is None else 2, 0.0, str(value))
 
 
-def _agent_names(runs: Sequence[Run]) -> list[str]:
-    differing = {kind: _differing(some) for kind, some in split_by(runs, _kind).items()}
-    twins = split_by(runs, lambda run: run.alike)
-    names = []
-    for run in runs:
-        parts = [_name(run)]
-        for key in differing[_kind(run)]:
-            parts.append(
-                f"{key.removeprefix('agent.').removeprefix('method.').removeprefix('plasticity.')}={run.settings.get(key)}"
-            )
-        code = code_of(run, twins[run.alike])
-        names.append(" ".join([*parts, f"({code})"] if code else parts))
-    return names
-
-
 def code_of(run: Run, others: Sequence[Run]) -> str:
     """Return in words a run's code, where it differs between others."""
     codes = [other.code for other in others]
@@ -509,11 +505,6 @@ def code_of(run: Run, others: Sequence[Run]) -> str:
 
 def _kind(run: Run) -> tuple[CurriculumKey, str]:
     return run.group, _name(run)
-
-
-def _differing(runs: Sequence[Run]) -> list[str]:
-    keys = {key for run in runs for key in run.settings}
-    return sorted(key for key in keys if len({json.dumps(run.settings.get(key)) for run in runs}) > 1)
 
 
 def _name(run: Run) -> str:

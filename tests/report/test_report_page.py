@@ -18,11 +18,11 @@ from ctgraph_rl.report import page as command
 from ctgraph_rl.report.figures.gallery import Gallery
 from ctgraph_rl.report.figures.trees import Trees, draw_trees, task_trees
 from ctgraph_rl.report.page import write_report
-from ctgraph_rl.report.sections import evaluation_curve, over_seeds, sections, training_curve
+from ctgraph_rl.report.sections import over_seeds, sections, training_curve
 from ctgraph_rl.run import run
 from ctgraph_rl.runner import show
 from ctgraph_rl.runs.load import Trained
-from ctgraph_rl.runs.read import find_runs
+from ctgraph_rl.runs.read import find_runs, histories
 
 for package in ("matplotlib", "jinja2", "scipy"):
     pytest.importorskip(package)
@@ -209,7 +209,7 @@ def test_curves_are_means_where_every_seed_has_a_value(tmp_path):
     (runs[0] / "run.jsonl").write_text("\n".join(kept) + "\n")
     found = find_runs([tmp_path])[0]
 
-    evaluations = evaluation_curve(found, "goal1")
+    evaluations = over_seeds([history.evaluations["goal1"] for history in histories(found)])
     training = training_curve(found, block=1, start=0, end=1000, places=1)
 
     assert evaluations == [(0, 0.0, None, None, 2), (2000, 0.375, None, None, 2)]

@@ -17,7 +17,6 @@ from ctgraph_rl.report.sections import (
     Point,
     Result,
     Section,
-    evaluation_curve,
     mean_curve,
     over_seeds,
     training_curve,
@@ -62,7 +61,7 @@ def learning_curves(section: Section) -> CaptionedFigure | None:
         _mark_blocks(axes, section, task)
         for result, look in choose_looks(section):
             seeds = [history.evaluations.get(label, []) for history in histories(result.finished)]
-            points = evaluation_curve(result.finished, label, result.bounds.of_task(label))
+            points = over_seeds(seeds, result.bounds.of_task(label))
             _draw(axes, look, [points], seeds if len(seeds) <= MOST_SEEDS else [])
         axes.set_title(short(label))
     return CaptionedFigure("curves", "Learning curves", caption, _finished(grid, section, "mean return"))
