@@ -382,12 +382,6 @@ class RunLog:
         names: dict[str, int] = {}
         rows = []
         values: list[float | None] = []
-        for task, training, own in self._stays(tasks):
-            rows.append((names.setdefault(label[task], len(names)), training, len(own)))
-            values += own
-        return RegimeTable(names, _row(values), *zip(*rows, strict=True))
-
-    def _stays(self, tasks: Sequence[int]) -> Iterator[tuple[int, bool, list[float | None]]]:
         at_end: dict[int, list[NamedValues]] = {}
         for m in self._evaluations(during=False):
             at_end.setdefault(m["block"], []).append(m)
@@ -395,9 +389,13 @@ class RunLog:
         for block in range(len(tasks) + 1):
             if block:
                 own = returns.get(block, _row([]))
-                yield tasks[block - 1], True, own[~own.isnan()].tolist()
+                own = own[~own.isnan()]
+                rows.append((names.setdefault(label[tasks[block - 1]], len(names)), True, len(own)))
+                values += own.tolist()
             for m in at_end.get(block, ()):
-                yield m["task"], False, [m["return_mean"]]
+                rows.append((names.setdefault(label[m["task"]], len(names)), False, 1))
+                values.append(m["return_mean"])
+        return RegimeTable(names, _row(values), *zip(*rows, strict=True))
 
     def _trained(self, trained: Trained | None) -> tuple[tuple[int, ...], ...]:
         if trained is None:

@@ -367,21 +367,28 @@ def _first_blocks(log: RunLog, curriculum: Curriculum) -> NamedValues:
     }
 
 
+def require_known(value: Any) -> Any:
+    """Return an input of metrics.
+
+    Raises:
+        ctgraph_rl.metrics.Undefined: for one that is not known, with the reason.
+    """
+    if isinstance(value, Undefined):
+        raise value
+    return value
+
+
 def _regimes(
     log: RunLog, curriculum: Curriculum, best: Tensor | Undefined, experts: Sequence[RunLog] | None
 ) -> NamedValues:
-    lowest = lowest_returns(curriculum.tasks)
-    for each in (best, lowest):
-        if isinstance(each, Undefined):
-            return dict.fromkeys(("regimes", "experts"), each)
-    assert isinstance(best, Tensor)
-    assert isinstance(lowest, Tensor)
     try:
+        optimal = require_known(best)
+        lowest = require_known(lowest_returns(curriculum.tasks))
         regimes = log.regimes(curriculum.trained, curriculum.labels)
-        require((not best.isnan().any(), "a task's optimal value is not known: its graph is too large"))
-    except ValueError as error:
+        require((not optimal.isnan().any(), "a task's optimal value is not known: its graph is too large"))
+    except (ValueError, Undefined) as error:
         return dict.fromkeys(("regimes", "experts"), Undefined(str(error)))
-    ranges = dict(zip(curriculum.labels, zip(lowest.tolist(), best.tolist(), strict=True), strict=True))
+    ranges = dict(zip(curriculum.labels, zip(lowest.tolist(), optimal.tolist(), strict=True), strict=True))
     curves = {}
     for label, expert in zip(curriculum.labels, experts or (), strict=False):
         returns = expert.training("return_mean")
@@ -399,21 +406,18 @@ def _areas(
     kind = "trapezoid_areas" if trapezoids else "areas"
     try:
         require((experts is not None, NO_EXPERTS))
-        for each in (best, curves):
-            if isinstance(each, Undefined):
-                raise each
-        assert isinstance(best, Tensor)
-        assert isinstance(curves, Curves)
-        best_is_1 = torch.allclose(best, torch.ones_like(best), rtol=0, atol=1e-9)
+        optimal = require_known(best)
+        known = require_known(curves)
+        best_is_1 = torch.allclose(optimal, torch.ones_like(optimal), rtol=0, atol=1e-9)
         require((best_is_1, "the definition needs tasks whose optimal value is 1"))
         alone = [expert.curves([(0,)]) for expert in experts or ()]
-        metrics.check_experts(curves, [curve.own_stage(0) for curve in alone])
+        metrics.check_experts(known, [curve.own_stage(0) for curve in alone])
         least = 2 if trapezoids else 1
-        for task in range(curves.performance.shape[1]):
-            count = len(curves.own_stage(task))
+        for task in range(known.performance.shape[1]):
+            count = len(known.own_stage(task))
             needs = f"areas by trapezoids need {least} evaluations, task {task + 1} has {count} in its block"
             require((count >= least, needs))
     except (ValueError, Undefined) as error:
         return dict.fromkeys((kind, f"expert_{kind}"), Undefined(str(error)))
     expert_areas = torch.cat([metrics.stage_areas(each, trapezoids) for each in alone])
-    return {kind: metrics.stage_areas(curves, trapezoids), f"expert_{kind}": expert_areas}
+    return {kind: metrics.stage_areas(known, trapezoids), f"expert_{kind}": expert_areas}
