@@ -386,13 +386,13 @@ class RunLog:
         for m in self._evaluations(during=False):
             at_end.setdefault(m["block"], []).append(m)
         returns = self.training_by_block("return_mean")
-        for block in range(len(tasks) + 1):
-            if block:
-                own = returns.get(block, _row([]))
+        for number in range(len(tasks) + 1):
+            if number:
+                own = returns.get(number, _row([]))
                 own = own[~own.isnan()]
-                rows.append((names.setdefault(label[tasks[block - 1]], len(names)), True, len(own)))
+                rows.append((names.setdefault(label[tasks[number - 1]], len(names)), True, len(own)))
                 values += own.tolist()
-            for m in at_end.get(block, ()):
+            for m in at_end.get(number, ()):
                 rows.append((names.setdefault(label[m["task"]], len(names)), False, 1))
                 values.append(m["return_mean"])
         return RegimeTable(names, _row(values), *zip(*rows, strict=True))
