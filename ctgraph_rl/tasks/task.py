@@ -266,10 +266,6 @@ class Task:
         """The expected discounted return of action probabilities per observation id, float [num_images, A]."""
         return values.policy_value(self, policy, gamma)
 
-    def success_prob(self, policy: Tensor) -> float:
-        """The probability that such a policy reaches the goal."""
-        return values.success_prob(self, policy)
-
     def memoryless_ceiling(self, deterministic: bool = False) -> float:
         """The best mean return without memory, by `values.memoryless_ceiling`."""
         return values.memoryless_ceiling(self, deterministic)

@@ -82,12 +82,6 @@ def policy_value(task: Task, policy: Tensor, gamma: float = 1.0) -> float:
     return _value_of_table(task, policy.detach().to("cpu", torch.float64), gamma).item()
 
 
-def success_prob(task: Task, policy: Tensor) -> float:
-    """The probability that a memoryless policy reaches the goal; arguments as `policy_value`."""
-    paid = replace(task, reward_fn=Needle(), goal_reward=1.0, fail_reward=0.0, step_reward=0.0)
-    return policy_value(paid, policy)
-
-
 @dataclass
 class Measures:
     """Exact means over the episodes of a policy."""

@@ -20,6 +20,7 @@ from helpers.oracles import (
     tree_states,
     tree_step,
 )
+from helpers.probability_tables import success_prob
 from helpers.task_families import extra, legacy_number, read, unique
 from tensordict import TensorDict
 from torch import Tensor
@@ -184,7 +185,7 @@ def test_an_extra_step_costs_one_step_reward_after_an_end_and_none_after_a_failu
         assert found == [-0.125 * gamma**6, 0.0]
     assert (extra(normal).optimal_value(1.0), normal.optimal_value(1.0)) == (1 - 7 / 8, 1 - 6 / 8)
     assert extra(normal, step_reward=-0.5).optimal_value(1.0) == -1.0  # it fails at once
-    assert extra(normal).success_prob(waits_well) == normal.success_prob(waits_well) == 1.0
+    assert success_prob(extra(normal), waits_well) == success_prob(normal, waits_well) == 1.0
 
 
 def test_the_value_of_the_best_policy_is_what_it_gets():

@@ -14,6 +14,7 @@ from helpers.probability_tables import (
     Mixed,
     make_task,
     random_policy,
+    success_prob,
     table,
     uniform,
 )
@@ -21,6 +22,7 @@ from torch import Tensor
 
 from ctgraph_rl import Needle, Task
 from ctgraph_rl.core.rewards import Arrival
+from ctgraph_rl.tasks.values import policy_measures
 from curricula.paper import ct_su_b1
 
 
@@ -45,7 +47,7 @@ def navigation(task: Task) -> Tensor:
 def test_the_uniform_policy_reaches_the_goal_with_p_r(b, d, p, unique):
     task = make_task(b, d, p, waits=2, decisions=3, unique=unique)
 
-    probs = [task.policy_value(uniform(task)), task.success_prob(uniform(task))]
+    probs = [task.policy_value(uniform(task)), success_prob(task, uniform(task))]
 
     assert probs == pytest.approx([task.graph.reward_prob_random] * 2, rel=1e-12, abs=0)
 
@@ -71,7 +73,7 @@ def test_the_optimal_policy_over_unique_decisions_has_the_optimal_value(b, d, p,
     values = {gamma: task.policy_value(policy, gamma) for gamma in GAMMAS}
 
     assert values == pytest.approx({gamma: task.optimal_value(gamma) for gamma in GAMMAS}, rel=1e-12)
-    assert [values[1.0], task.success_prob(policy)] == pytest.approx([2.0, 1.0], rel=1e-12)
+    assert [values[1.0], success_prob(task, policy)] == pytest.approx([2.0, 1.0], rel=1e-12)
 
 
 def test_a_policy_by_hand_at_d_1_with_every_probability_different():
@@ -84,7 +86,7 @@ def test_a_policy_by_hand_at_d_1_with_every_probability_different():
     first_wait = (0.4 * gamma * decision - 0.2) / 0.8
 
     assert task.policy_value(policy, gamma) == pytest.approx(gamma * first_wait, rel=1e-14)
-    assert task.success_prob(policy) == pytest.approx((0.4 / 0.6) * 0.6 * (0.4 / 0.6), rel=1e-14)
+    assert success_prob(task, policy) == pytest.approx((0.4 / 0.6) * 0.6 * (0.4 / 0.6), rel=1e-14)
 
 
 def value_by_chain(task: Task, policy: Tensor, gamma: float, end_reward: Callable[[int], float]) -> float:
@@ -177,7 +179,7 @@ def test_a_policy_of_certain_failure_gets_the_fail_reward_when_it_fails():
     values = [task.policy_value(policy, 0.5) for policy in (fails_waiting, fails_deciding)]
 
     assert values == [0.5 * -2, 0.25 * -2]
-    assert task.success_prob(fails_waiting) == 0.0
+    assert success_prob(task, fails_waiting) == 0.0
 
 
 def test_the_success_probability_does_not_depend_on_rewards():
@@ -186,7 +188,10 @@ def test_the_success_probability_does_not_depend_on_rewards():
 
     others = [replace(needle, reward_fn=fn, goal_reward=-3.0, fail_reward=2.0) for fn in (Needle(), Mixed())]
 
-    assert [task.success_prob(policy) for task in others] == pytest.approx([needle.policy_value(policy)] * 2, rel=1e-14)
+    expected = needle.policy_value(policy)
+    for task in others:
+        [measures] = policy_measures(task, policy.unsqueeze(0))
+        assert measures.success_rate == pytest.approx(expected, rel=1e-14)
 
 
 @pytest.mark.parametrize("gamma", [-0.1, 1.5, math.nan, "1"])

@@ -1,12 +1,12 @@
 """One-hot tasks and tables of action probabilities, for the tests of exact values."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from ctgraph_rl import CTGraph, Observations, OneHot, StateType, Task
+from ctgraph_rl import CTGraph, Needle, Observations, OneHot, StateType, Task
 from ctgraph_rl.core.rewards import Arrival
 
 F64 = torch.float64
@@ -74,3 +74,9 @@ def uniform(task: Task) -> Tensor:
 def random_policy(task: Task, num_actions: int, generator: torch.Generator, power: float = 1.0) -> Tensor:
     weights = torch.rand(task.images.num_images, num_actions, generator=generator, dtype=F64) ** power
     return weights / weights.sum(-1, keepdim=True)
+
+
+def success_prob(task: Task, policy: Tensor) -> float:
+    """The exact probability that action probabilities by observation id reach the goal."""
+    paid = replace(task, reward_fn=Needle(), goal_reward=1.0, fail_reward=0.0, step_reward=0.0)
+    return paid.policy_value(policy)

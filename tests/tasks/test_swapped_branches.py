@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers.oracles import confounding, fully_observable, scripts, surjective, tree_states, tree_step
+from helpers.probability_tables import success_prob
 
 from ctgraph_rl import CTGraphEnv, Gradient, Task
 from ctgraph_rl.core.graph import StateType
@@ -166,7 +167,7 @@ def test_random_actions_reach_the_goal_with_probability_p_r(task):
         (task.images.num_images, task.graph.branching_factor + 1), 1 / (task.graph.branching_factor + 1)
     )
 
-    assert task.success_prob(uniform) == pytest.approx(task.graph.reward_prob_random)
+    assert success_prob(task, uniform) == pytest.approx(task.graph.reward_prob_random)
 
 
 @pytest.mark.parametrize("policy", [OptimalPolicy, SearchPolicy])
