@@ -120,6 +120,6 @@ def line(rows, measure: str, agent: str = "PPO"):
 def sum_again(run_dir: Path) -> None:
     """Give a finished run whose files were changed the sums of these."""
     content = json.loads((run_dir / "metrics.json").read_text())
-    del content["files"]
+    content.pop("files", None)
     sums = {"run": "0", **sums_of(run_dir), "metrics.json": sum_of(json.dumps(content).encode())}
     (run_dir / "metrics.json").write_text(json.dumps({"files": sums, **content}))
