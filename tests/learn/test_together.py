@@ -22,7 +22,15 @@ from baselines.methods.method import Method
 from baselines.update import seeds as together
 from baselines.update.seeds import SeedGroup
 from baselines.update.stack import Stack
-from baselines.update.update import losses_of, total_loss, transform_gradients, unstacked, update, with_tensors
+from baselines.update.update import (
+    losses_of,
+    over_seeds,
+    total_loss,
+    transform_gradients,
+    unstacked,
+    update,
+    with_tensors,
+)
 from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, learn_curriculum
 from ctgraph_rl.learn.refusals import why_not_together
 from ctgraph_rl.runs.config import target
@@ -236,7 +244,8 @@ def test_seeds_act_by_a_graph_of_the_operations_of_their_networks_as_they_are(ma
 
     def checked(group, stack, data):
         outputs = act(group, stack, data)
-        present = Stack(group.learners).outputs(data)
+        fresh = Stack(group.learners)
+        present = over_seeds(group.first, lambda learner, weights, data: learner.outputs(data), fresh.state, data)
         assert outputs.keys() == present.keys()
         compared.extend(torch.equal(outputs[key], present[key]) for key in present)
         return outputs
