@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from itertools import groupby
 from typing import Any
 
 import torch
@@ -148,14 +149,21 @@ class Samples:
 
     def state(self) -> NamedValues:
         """Return a state of plain values."""
-        return {"parts": list(self.minibatches)}
+        alike = groupby(self.minibatches, lambda minibatch: (minibatch["action"].shape[1:], [*minibatch]))
+        return {"parts": [_joined(list(minibatches)) for _, minibatches in alike]}
 
     def restore(self, state: ReadOnlyValues, device: torch.device) -> None:
         """Restore what `state` returned."""
         self.clear()
-        for minibatch in state["parts"]:
-            self.minibatches.append({key: value.to(device) for key, value in minibatch.items()})
+        for part in state["parts"]:
+            split = {key: value.to(device).split(part["sizes"]) for key, value in part["items"].items()}
+            self.minibatches += [dict(zip(split, values, strict=True)) for values in zip(*split.values(), strict=True)]
         self.num_held = sum(map(num_learnt, self.minibatches))
+
+
+def _joined(minibatches: Sequence[Items]) -> NamedValues:
+    items = {key: torch.cat([minibatch[key] for minibatch in minibatches]) for key in minibatches[0]}
+    return {"sizes": [len(minibatch["action"]) for minibatch in minibatches], "items": items}
 
 
 class SampledImportance(Importance):
