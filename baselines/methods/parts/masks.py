@@ -54,7 +54,7 @@ class Masks(TaskMethod):
         super().setup()
         vectors = [name for name, each in self.weights.named if each.ndim < 2 and "bias" not in name.rpartition(".")[2]]
         rule = f"{type(self).__name__} masks weight matrices, and {', '.join(vectors)} are none"
-        require((not vectors, f"{rule}: take another method, or a network without such layers"))
+        require((not vectors, f"{rule}: take another method, or no such layers, which plasticity=layer_norm adds"))
         self.ended = 0
         scores = self.weights.zeros().repeat(self.num_tasks, 1)
         own = self.initial_scores()
