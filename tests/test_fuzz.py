@@ -137,7 +137,14 @@ def tiny(name: str) -> dict[str, Any]:
     """The settings of an agent's yaml, made small."""
     settings = dict(next(entry for entry in entries("agent") if entry.name == name).settings)
     small = {"num_envs": 2, "num_steps": 8, "hidden_size": 4, "batch_size": 4, "buffer_size": 64, "num_minibatches": 1}
-    small |= {"num_epochs": 1, "num_updates": 1, "compile": False, "adapt_episodes": 2, "num_trials": 1}
+    small |= {
+        "num_epochs": 1,
+        "num_updates": 1,
+        "compile": False,
+        "adapt_episodes": 2,
+        "num_trials": 1,
+        "segment_size": 2,
+    }
     small |= {"num_steps": 24} if "adapt_episodes" in settings else {}
     return settings | {key: value for key, value in small.items() if key in settings}
 
