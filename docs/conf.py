@@ -56,6 +56,7 @@ OTHERS = (
 SHORT_NAMES = (
     "NDArray|Path|Sequence|Span|Tensor|TensorDictBase|nn.Module|nn.Linear|Rule|NamedValues|ReadOnlyValues|Items|Learnt"
     "|TensorsByName"
+    r"|baselines\.(cavia\.Context|maml\.AllWeights)"  # models of inner loops
     r"|ctgraph_rl\.tasks\.life\.\w+"  # parts of a stream
     r"|ctgraph_rl\.tasks\.observations\.Number"  # a type variable
 )
