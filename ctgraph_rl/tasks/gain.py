@@ -48,6 +48,7 @@ class Reached(NamedTuple):
     """What a policy reaches in a block and loses against the best, on average."""
 
     at_end: float  # the return of its last episode
+    in_episodes: float  # lost return, in finished episodes
     in_frames: float  # lost reward, in all frames
 
 
@@ -71,9 +72,9 @@ def reached_by_policies(task: Task, num_frames: int, pause: int = 0) -> dict[str
 
     def reached(value: float, length: float) -> Reached:
         num_episodes = num_frames / (length + pause)
-        return Reached(value, num_frames * gain - num_episodes * value)
+        return Reached(value, num_episodes * (best - value), num_frames * gain - num_episodes * value)
 
-    found = {"optimal": Reached(best, 0.0), "random": reached(chance.return_mean, chance.length_mean)}
+    found = {"optimal": Reached(best, 0.0, 0.0), "random": reached(chance.return_mean, chance.length_mean)}
     try:
         ceiling = memoryless_ceiling(task)
     except ValueError:  # not a needle, so the other two have no closed form
@@ -84,5 +85,5 @@ def reached_by_policies(task: Task, num_frames: int, pause: int = 0) -> dict[str
     tried = min(num_frames / (length + pause), num_goals)
     failures = tried - tried * (tried + 1) / (2 * num_goals)
     missed = (1 - tried / num_goals) * task.goal_reward
-    found["search"] = Reached(best - missed, failures * task.goal_reward)
+    found["search"] = Reached(best - missed, failures * task.goal_reward, failures * task.goal_reward)
     return found

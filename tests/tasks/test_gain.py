@@ -38,13 +38,13 @@ def test_a_reward_of_every_step_adds_to_the_largest_gain():
 def test_what_policies_reach_and_lose_in_a_block_by_hand():
     found = reached_by_policies(ct_fo_b1(), num_frames=6 * 10)  # four goals, ten optimal episodes
 
-    assert found["optimal"] == (1.0, 0.0)
-    assert found["memoryless"] == pytest.approx((1.0, 0.0), abs=1e-9)  # all is observed
-    assert found["search"] == pytest.approx((1.0, 1.5))  # 3/4 + 2/4 + 1/4
-    assert reached_by_policies(ct_fo_b1(), num_frames=12)["search"] == pytest.approx((0.5, 1.25))
+    assert found["optimal"] == (1.0, 0.0, 0.0)
+    assert found["memoryless"] == pytest.approx((1.0, 0.0, 0.0), abs=1e-9)  # all is observed
+    assert found["search"] == pytest.approx((1.0, 1.5, 1.5))  # 3/4 + 2/4 + 1/4
+    assert reached_by_policies(ct_fo_b1(), num_frames=12)["search"] == pytest.approx((0.5, 1.25, 1.25))
     hidden = reached_by_policies(ct_fo_b1(), num_frames=14, pause=1)  # again two episodes
-    assert hidden["search"] == pytest.approx((0.5, 1.25))
-    assert hidden["memoryless"] == pytest.approx((1.0, 0.0), abs=1e-9)
+    assert hidden["search"] == pytest.approx((0.5, 1.25, 1.25))
+    assert hidden["memoryless"] == pytest.approx((1.0, 0.0, 0.0), abs=1e-9)
 
 
 def test_the_random_policy_loses_what_it_is_measured_to_lose():
@@ -53,10 +53,11 @@ def test_the_random_policy_loses_what_it_is_measured_to_lose():
     value = played["episode_reward"].double().mean().item()
     length = played["step_count"].double().mean().item()
 
-    at_end, in_frames = reached_by_policies(task, 1000)["random"]
+    at_end, in_episodes, in_frames = reached_by_policies(task, 1000)["random"]
 
     assert at_end == pytest.approx(value, abs=0.003)  # standard error 0.001
-    assert in_frames == pytest.approx(1000 * (1 / 6 - value / length), rel=0.04)  # standard error 1%
+    assert in_episodes == pytest.approx(1000 / length * (1 - value), rel=0.04)  # standard error 1%
+    assert in_frames == pytest.approx(1000 * (1 / 6 - value / length), rel=0.04)
 
 
 def test_a_search_fails_as_often_as_it_is_measured_to():
@@ -65,7 +66,7 @@ def test_a_search_fails_as_often_as_it_is_measured_to():
 
     failures = 5 - 5 * played["episode_reward"].double().mean().item()
 
-    assert reached_by_policies(task, 5 * 6)["search"].in_frames == 1.5
+    assert reached_by_policies(task, 5 * 6)["search"].in_episodes == 1.5
     assert failures == pytest.approx(1.5, abs=0.2)  # standard error 0.06
 
 
