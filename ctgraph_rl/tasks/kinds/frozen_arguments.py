@@ -16,7 +16,7 @@ DICT = "DictArgument"
 class FrozenArguments(str):
     """Arguments in the order of their names, as the JSON of pairs of name and value.
 
-    A tuple is an object with ``type`` and ``items``, and so is a dict, as pairs in the order written.
+    A tuple or a dict is an object with ``type`` and ``items``. The items of a dict are pairs in the order written.
     """
 
     @property
